@@ -1,0 +1,317 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every node's program needs around its node: arguments, signals, spinning, a clean end, diagnostics.
+
+A node is any `rclpy.node.Node`. Three attributes are looked at when it has them:
+
+- `done` (bool): set it to end the program with exit code 0;
+- `error` (Exception): set it to end the program; a `UserError` becomes one line and exit code 2;
+- `close()`: called once at the end, before the node is destroyed, when signals no longer interrupt: stop threads,
+  send the last message, close files.
+"""
+
+import os
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from types import FrameType
+
+import rclpy
+import rclpy.logging
+import yaml
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.executors import Executor, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+from aeropend_sim import interface
+
+try:
+    from rclpy.experimental import EventsExecutor
+except ImportError:  # older Jazzy
+    EventsExecutor = SingleThreadedExecutor
+
+SPIN_S = 0.1
+"""The longest the program takes to notice a signal, s."""
+
+
+class UserError(Exception):
+    """What the user can put right: one line that says what, where, and what to do."""
+
+
+class Stop:
+    """Turns SIGINT and SIGTERM into a flag, from `install` on."""
+
+    def __init__(self) -> None:
+        self.requested = False
+
+    def install(self) -> None:
+        """Take over both signals. Only in the main thread."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._request)
+
+    def _request(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True
+
+    @staticmethod
+    def ignore() -> None:
+        """Let no signal interrupt the end of the program. Only in the main thread."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
+
+
+class Worker(threading.Thread):
+    """A node's own thread. What goes wrong in it ends the program like an error anywhere else.
+
+    Args:
+        node: gets `error` when the target raises, and `done` when it returns.
+        target: called with an event that says it is time to stop.
+        name: of the thread, as system tools show it.
+    """
+
+    def __init__(self, node: Node, target: Callable[[threading.Event], None], name: str) -> None:
+        super().__init__(name=name, daemon=True)
+        self._node = node
+        self._body = target
+        self._end = threading.Event()
+
+    def run(self) -> None:
+        """Thread body."""
+        try:
+            self._body(self._end)
+            self._node.done = True
+        except Exception as error:  # handed to the main thread, which raises it
+            self._node.error = error
+
+    def stop(self) -> None:
+        """Ask the target to return and wait until it has."""
+        self._end.set()
+        if self.is_alive():
+            self.join()
+
+
+class Diagnostics:
+    """Publishes a node's counters on `/diagnostics` once a second of wall time.
+
+    Args:
+        node: whose counters.
+        report: returns what is wrong now ("" for nothing) and the counters.
+        hardware_id: what the node stands for.
+    """
+
+    def __init__(
+        self, node: Node, report: Callable[[], tuple[str, Mapping[str, object]]], hardware_id: str = ""
+    ) -> None:
+        self._node = node
+        self._report = report
+        self._hardware_id = hardware_id
+        self._publisher = node.create_publisher(DiagnosticArray, interface.DIAGNOSTICS, interface.QOS)
+        # wall time: a node whose /clock has stopped must still be heard
+        self._timer = node.create_timer(1.0, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def publish(self) -> None:
+        """Publish the counters now."""
+        warning, values = self._report()
+        status = DiagnosticStatus(
+            level=DiagnosticStatus.WARN if warning else DiagnosticStatus.OK,
+            name=self._node.get_fully_qualified_name().lstrip("/"),
+            message=warning or "ok",
+            hardware_id=self._hardware_id,
+            values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)
+
+
+def _text(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def run(make_node: Callable[[], Node], args: Sequence[str] | None = None, usage: str | None = None) -> int:
+    """Run one node until it is done or a signal comes, and end cleanly.
+
+    SIGINT and SIGTERM, once or many times, at any moment from here on, end the program with exit code 0: rclpy's own
+    handlers are not used because they tear the context down under a spinning executor.
+
+    Args:
+        make_node: builds the node, after `rclpy.init`. May raise UserError.
+        args: command line without the program's name; None takes `sys.argv`.
+        usage: help text. When given, `--help` prints it, and any argument outside `--ros-args` is refused. When None
+            the caller has parsed the other arguments itself.
+
+    Returns:
+        The exit code: 0, or 2 after a UserError, which is printed on standard error as one line.
+    """
+    argv = list(sys.argv[1:] if args is None else args)
+    program = os.path.basename(sys.argv[0]) or "aeropend"
+    stop = Stop()
+    stop.install()
+    try:
+        with tempfile.TemporaryDirectory(prefix="aeropend_") as folder:
+            readable = _readable_parameter_files(argv, folder)
+            try:
+                if usage is not None and _wants_help(readable):
+                    print(usage.strip())
+                    return 0
+                _init(readable)
+            except UserError as error:  # say the user's file, not our copy of it
+                names = dict(zip(readable, argv, strict=True))
+                raise UserError(" ".join(names.get(word.strip("'."), word) for word in str(error).split())) from error
+        return _spin(make_node, stop)
+    except UserError as error:
+        print(f"{program}: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    finally:
+        stop.ignore()
+        rclpy.try_shutdown()
+
+
+def _wants_help(argv: list[str]) -> bool:
+    try:
+        rest = remove_ros_args(["node", *argv])[1:]
+    except Exception as error:  # rclpy has several unrelated classes for this
+        raise UserError(_short(error)) from error
+    if {"-h", "--help"} & set(rest):
+        return True
+    if rest:
+        raise UserError(f"unknown argument '{rest[0]}': set parameters with --ros-args -p name:=value, see --help")
+    return False
+
+
+def _init(argv: list[str]) -> None:
+    """Start rclpy, with its complaints about the command line as one UserError."""
+    rclpy.logging.set_logger_level("rcl", rclpy.logging.LoggingSeverity.FATAL)  # the UserError says it already
+    try:
+        rclpy.init(args=["node", *argv], signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:
+        raise UserError(_short(error)) from error
+    finally:
+        rclpy.logging.set_logger_level("rcl", rclpy.logging.LoggingSeverity.UNSET)
+
+
+def _short(error: Exception) -> str:
+    """Strip C source lines and parser internals from rcl's message."""
+    text = str(error).split(", at /")[0].split(". Error: Expected lexeme")[0]
+    for prefix in ("failed to initialize rcl: ", "Failed to parse ROS arguments: "):
+        text = text.removeprefix(prefix)
+    return f"unknown ROS argument {text}" if type(error).__name__ == "UnknownROSArgsError" else text
+
+
+def _readable_parameter_files(argv: list[str], folder: str) -> list[str]:
+    """Check every `--params-file` and rewrite those that rcl would misread, into `folder`.
+
+    rcl's YAML reader loses its place after an empty mapping (what follows lands under the wrong name, or is lost) and
+    refuses a key without value. Both become an empty string here, so that the node sees them.
+    """
+    argv = list(argv)
+    for at, argument in enumerate(argv[:-1]):
+        if argument != "--params-file":
+            continue
+        path = argv[at + 1]
+        try:
+            with open(path, encoding="utf-8") as file:
+                root = yaml.compose(file, Loader=yaml.SafeLoader)
+        except OSError as error:
+            raise UserError(f"cannot read parameter file '{path}': {error.strerror}") from error
+        except UnicodeDecodeError as error:
+            raise UserError(f"cannot read parameter file '{path}': not a text file") from error
+        except yaml.YAMLError as error:
+            mark = getattr(error, "problem_mark", None)
+            where = f" line {mark.line + 1}" if mark else ""
+            raise UserError(f"parameter file '{path}'{where}: {getattr(error, 'problem', error)}") from error
+        if root is None:
+            continue
+        _check_sections(path, root)
+        if _fill_empty(root):
+            argv[at + 1] = os.path.join(folder, f"{at}.yaml")
+            with open(argv[at + 1], "w", encoding="utf-8") as file:
+                yaml.serialize(root, file, Dumper=yaml.SafeDumper)
+    return argv
+
+
+def _check_sections(path: str, root: yaml.Node) -> None:
+    """Refuse a file that is not NODE: ros__parameters: ..., which rcl would say less clearly."""
+
+    def refuse(node: yaml.Node, why: str) -> None:
+        raise UserError(
+            f"parameter file '{path}' line {node.start_mark.line + 1}: {why}; it must read '/**: ros__parameters: ...'"
+        )
+
+    def section(node: yaml.Node) -> None:
+        if not isinstance(node, yaml.MappingNode):
+            refuse(node, "no parameters")
+        for key, value in node.value:
+            if not isinstance(value, yaml.MappingNode):
+                refuse(key, f"'{key.value}' holds no parameters")
+            if key.value != "ros__parameters":
+                section(value)
+
+    section(root)
+
+
+def _fill_empty(node: yaml.Node) -> bool:
+    """Put an empty string in place of each empty mapping and null below ros__parameters. True when there was one."""
+    changed = False
+    if isinstance(node, yaml.MappingNode):
+        for at, (key, value) in enumerate(node.value):
+            empty_map = isinstance(value, yaml.MappingNode) and not value.value and key.value != "ros__parameters"
+            null = isinstance(value, yaml.ScalarNode) and value.tag == "tag:yaml.org,2002:null"
+            if empty_map or null:
+                node.value[at] = (key, yaml.ScalarNode("tag:yaml.org,2002:str", "", style='"'))
+                changed = True
+            else:
+                changed |= _fill_empty(value)
+    return changed
+
+
+def _spin(make_node: Callable[[], Node], stop: Stop) -> int:
+    """Make the node, spin it to its end, take it down. Returns 0 or raises."""
+    node: Node | None = None
+    executor: Executor | None = None
+    try:
+        if stop.requested:
+            return 0
+        node = make_node()
+        executor = EventsExecutor()
+        executor.add_node(node)
+        # spin() of the EventsExecutor can hang at the end; in slices it does not, and the flag is seen
+        while not (stop.requested or getattr(node, "done", False) or getattr(node, "error", None)):
+            executor.spin_once(timeout_sec=SPIN_S)
+    finally:
+        stop.ignore()
+        if node is not None and hasattr(node, "close"):
+            node.close()
+        if executor is not None:
+            executor.shutdown()
+        if node is not None:
+            with suppress(Exception):  # the node is going anyway
+                node.destroy_node()
+    if error := getattr(node, "error", None):
+        raise error
+    return 0
+
+
+def wait_until(condition: Callable[[], bool], stop: threading.Event, poll_s: float = 0.05) -> bool:
+    """Poll a condition until it holds (True) or `stop` is set (False)."""
+    while not condition():
+        if stop.wait(poll_s):
+            return False
+    return True
+
+
+def monotonic_to_ros_ns(clock_now_ns: Callable[[], int]) -> int:
+    """Return the offset that turns `time.monotonic_ns()` into a clock's time, ns: the tightest of five readings."""
+    readings = []
+    for _ in range(5):
+        before = time.monotonic_ns()
+        now = clock_now_ns()
+        after = time.monotonic_ns()
+        readings.append((after - before, now - (before + after) // 2))
+    return min(readings)[1]
