@@ -7,6 +7,9 @@ A node is any `rclpy.node.Node`. Three attributes are looked at when it has them
 - `error` (Exception): set it to end the program; a `UserError` becomes one line and exit code 2;
 - `close()`: called once at the end, before the node is destroyed, when signals no longer interrupt: stop threads,
   send the last message, close files.
+
+Subscription callbacks take the message alone: the EventsExecutor of this rclpy fails on callbacks that also want the
+message info, raw or not.
 """
 
 import os
@@ -34,7 +37,7 @@ from aeropend_sim import interface
 
 try:
     from rclpy.experimental import EventsExecutor
-except ImportError:  # older Jazzy
+except ImportError:  # an older rclpy
     EventsExecutor = SingleThreadedExecutor
 
 SPIN_S = 0.1
