@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+# Each target does its own set-up: .venv in this folder, packages from PyPI, Debian packages where one is missing.
+
+# Name an interpreter for .venv with PYTHON=python3.12 (3.10 or newer; default: the .venv there is, else python3).
+export PYTHON
+
+# Nobody else's plant moves: ROS 2 talks on this machine only, unless told otherwise.
+export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
+
+# A ROS 2 install that the shell has sourced would mix its packages with those of .venv.
+unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH LD_LIBRARY_PATH PYTHONHOME PYTHONPATH RMW_IMPLEMENTATION
+
+BIN := .venv/bin
+SETUP := tools/setup requirements.txt constraints.txt $(wildcard src/*/package.xml src/*/setup.py src/*/setup.cfg)
+
+# Look again when the tree was moved or copied, or an interpreter is named.
+ifneq ($(CURDIR)$(PYTHON),$(shell cat .venv/.tree 2>/dev/null))
+.PHONY: .venv/.runtime .venv/.dev
+endif
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test bench lint clean distclean
+
+help: ## show this
+	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile | expand -t 18
+
+demo: .venv/.runtime ## run a plant with a hidden effect and name it (EFFECT=coulomb_friction pins one, ARGS="--help")
+	$(BIN)/demo $(if $(EFFECT),--effect $(EFFECT)) $(ARGS)
+
+# pytest comes last, its summary closes the output.
+test: .venv/.dev ## build and test with colcon in a temporary folder, then run every test (ARGS="-k plant")
+	tools/colcon-check
+	$(BIN)/python -m pytest $(ARGS)
+
+bench: .venv/.runtime ## measure speed beside C and scipy
+	tools/setup compiler
+	$(BIN)/python test/bench.py $(ARGS)
+
+lint: .venv/.dev ## check style and types
+	$(BIN)/ruff check
+	$(BIN)/mypy
+
+clean: ## remove what building and testing left
+	rm -rf build install log .mypy_cache .pytest_cache .ruff_cache src/*/build src/*/*.egg-info
+	find src test -name __pycache__ -type d -prune -exec rm -rf {} +
+
+distclean: clean ## remove .venv too
+	rm -rf .venv
+
+.venv/.runtime: $(SETUP)
+	tools/setup runtime
+
+.venv/.dev: $(SETUP) requirements-dev.txt
+	tools/setup dev

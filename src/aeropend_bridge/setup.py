@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Package set-up, for colcon and pip alike."""
+
+from setuptools import find_packages, setup
+
+PACKAGE = "aeropend_bridge"
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(exclude=["test", "test.*"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+    ],
+    install_requires=[],
+    extras_require={"test": ["pytest", "pytest-timeout"]},
+    python_requires=">=3.10",
+    zip_safe=False,
+    maintainer="aeropend maintainers",
+    maintainer_email="maintainers@aeropend.example",
+    description="The bridge to the real aeropendulum's board.",
+    license="Apache-2.0",
+)

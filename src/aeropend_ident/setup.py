@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Package set-up, for colcon and pip alike."""
+
+from setuptools import find_packages, setup
+
+PACKAGE = "aeropend_ident"
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(exclude=["test", "test.*"]),
+    package_data={"aeropend_ident": ["gap/*.html.j2"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+    ],
+    install_requires=["aeropend-sim", "Jinja2", "mcap", "numba", "numpy", "PyYAML", "rich", "rosbags", "scipy"],
+    extras_require={"test": ["pytest", "pytest-timeout"]},
+    python_requires=">=3.10",
+    zip_safe=False,
+    maintainer="aeropend maintainers",
+    maintainer_email="maintainers@aeropend.example",
+    description="Records and replays the aeropendulum, compares it with the model and names what the model is missing.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "record = aeropend_ident.record:main",
+            "replay = aeropend_ident.replay:main",
+            "recover = aeropend_ident.recover:main",
+            "diagnose = aeropend_ident.diagnose:main",
+            "demo = aeropend_ident.demo:main",
+        ]
+    },
+)

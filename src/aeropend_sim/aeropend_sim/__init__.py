@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The aeropendulum's model, and the plant node that runs it."""

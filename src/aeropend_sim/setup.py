@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Package set-up, for colcon and pip alike."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+PACKAGE = "aeropend_sim"
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(exclude=["test", "test.*"]),
+    package_data={"aeropend_sim": ["config/*.yaml"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+        (f"share/{PACKAGE}/config", glob("aeropend_sim/config/*.yaml")),
+    ],
+    install_requires=["numba", "numpy", "PyYAML", "scipy"],
+    extras_require={"test": ["pytest", "pytest-timeout"]},
+    python_requires=">=3.10",
+    zip_safe=False,
+    maintainer="aeropend maintainers",
+    maintainer_email="maintainers@aeropend.example",
+    description="The aeropendulum's model (dynamics, actuator, sensing, the catalogue of effects) and the simulated plant node.",
+    license="Apache-2.0",
+    entry_points={"console_scripts": ["plant = aeropend_sim.plant:main"]},
+)
