@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every node's program needs around its node: arguments, signals, spinning, a clean end, diagnostics.
+"""What every node's program needs around its node: arguments, parameters, signals, a clean end, diagnostics.
 
 A node is any `rclpy.node.Node`. Three attributes are looked at when it has them:
 
@@ -12,20 +12,24 @@ Subscription callbacks take the message alone: the EventsExecutor of this rclpy 
 message info, raw or not.
 """
 
-import os
+import difflib
+import math
 import signal
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import rclpy
 import rclpy.logging
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.executors import Executor, SingleThreadedExecutor
@@ -59,7 +63,7 @@ class Stop:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._request)
 
-    def _request(self, number: int, frame: FrameType | None) -> None:
+    def _request(self, _number: int, _frame: FrameType | None) -> None:
         self.requested = True
 
     @staticmethod
@@ -89,7 +93,7 @@ class Worker(threading.Thread):
         try:
             self._body(self._end)
             self._node.done = True
-        except Exception as error:  # handed to the main thread, which raises it
+        except Exception as error:  # noqa: BLE001 - the main thread raises it
             self._node.error = error
 
     def stop(self) -> None:
@@ -137,6 +141,113 @@ def _text(value: object) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
+@dataclass(frozen=True)
+class Setting:
+    """A parameter of a node: what the user may give, and what is taken otherwise.
+
+    The default's type is the parameter's type; a float also takes a YAML integer. Lists are lists of floats.
+    """
+
+    default: bool | int | float | str | list[float]
+    description: str
+    unit: str = ""
+    low: float = -math.inf
+    high: float = math.inf
+    choices: tuple[str, ...] = ()
+
+    def check(self, name: str, value: object) -> Any:
+        """Return the value in the setting's own type, or raise UserError."""
+        kind = type(self.default)
+        if kind is list and not isinstance(value, (str, bytes, bool)) and hasattr(value, "__iter__"):
+            return [self._number(name, item, float) for item in value]
+        if kind in (int, float):
+            return self._number(name, value, kind)
+        if type(value) is not kind:
+            wanted = {bool: "true or false", str: "text", list: "a list of numbers"}[kind]
+            raise UserError(f"parameter {name} is {value!r}: give {wanted}")
+        if self.choices and value not in self.choices:
+            raise UserError(f"parameter {name} is '{value}': give one of {', '.join(self.choices)}")
+        return value
+
+    def _number(self, name: str, value: object, kind: type) -> float | int:
+        whole = kind is int
+        if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
+            raise UserError(f"parameter {name} is {value!r}: give a {'whole ' if whole else ''}number")
+        if not self.low <= value <= self.high or not math.isfinite(value):
+            raise UserError(f"parameter {name} is {value:g}: give {self.low:g} to {self.high:g} {self.unit}".rstrip())
+        return kind(value)
+
+    def descriptor(self) -> ParameterDescriptor:
+        """Describe the parameter to ROS tools: unit and meaning, range, and that it is fixed while the node runs."""
+        text = f"[{self.unit}] {self.description}" if self.unit else self.description
+        descriptor = ParameterDescriptor(description=text, read_only=True)
+        if self.choices:
+            descriptor.additional_constraints = "one of " + ", ".join(self.choices)
+        if math.isfinite(self.low) and math.isfinite(self.high):
+            if isinstance(self.default, float):
+                descriptor.floating_point_range = [FloatingPointRange(from_value=self.low, to_value=self.high)]
+            elif type(self.default) is int:
+                descriptor.integer_range = [IntegerRange(from_value=int(self.low), to_value=int(self.high), step=1)]
+        return descriptor
+
+
+def overrides(node: Node) -> dict[str, Any]:
+    """Return what the command line and parameter files set, by full name, without rclpy's own parameters.
+
+    The node must have been made with `automatically_declare_parameters_from_overrides=True`.
+    """
+    own = ("use_sim_time", "start_type_description_service")
+    given = {name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items()}
+    return {name: value for name, value in given.items() if name not in own and not name.startswith("qos_overrides.")}
+
+
+def declare(node: Node, name: str, value: object, descriptor: ParameterDescriptor) -> None:
+    """Declare a parameter with this value, in place of the bare one that the override made."""
+    if node.has_parameter(name):
+        node.undeclare_parameter(name)
+    node.declare_parameter(name, value, descriptor, ignore_override=True)
+
+
+def read_settings(node: Node, table: Mapping[str, Setting], given: Mapping[str, object]) -> dict[str, Any]:
+    """Check and declare a node's parameters.
+
+    Args:
+        node: made with `automatically_declare_parameters_from_overrides=True`.
+        table: every parameter by name.
+        given: what was set; see `overrides`.
+
+    Returns:
+        Every parameter of the table.
+
+    Raises:
+        UserError: unknown name, wrong type, or out of range.
+    """
+    for name in given:
+        if name not in table:
+            near = difflib.get_close_matches(name, table, n=1)
+            raise UserError(f"unknown parameter {name}: " + (f"did you mean {near[0]}?" if near else "see --help"))
+    values = {name: setting.check(name, given.get(name, setting.default)) for name, setting in table.items()}
+    for name, value in values.items():
+        declare(node, name, value, table[name].descriptor())
+    return values
+
+
+def usage(summary: str, table: Mapping[str, Setting], examples: Sequence[str], more: str = "") -> str:
+    """Return the text of `--help`."""
+    lines = [summary, "", "usage: " + examples[0]]
+    lines += ["       " + example for example in examples[1:]]
+    lines += ["", "parameters (-p name:=value, or a ROS parameter file):"]
+    for name, setting in table.items():
+        limits = ", ".join(setting.choices)
+        if math.isfinite(setting.low) and math.isfinite(setting.high):
+            limits = f"{setting.low:.12g}..{setting.high:.12g}"
+        unit = f" {setting.unit}" if setting.unit else ""
+        default = str(setting.default).lower() if isinstance(setting.default, bool) else setting.default
+        limits = f"{limits}{unit}; " if limits else ""
+        lines.append(f"  {name:<18} {setting.description}; {limits}default {default}")
+    return "\n".join([*lines, *(["", more] if more else [])])
+
+
 def run(make_node: Callable[[], Node], args: Sequence[str] | None = None, usage: str | None = None) -> int:
     """Run one node until it is done or a signal comes, and end cleanly.
 
@@ -153,7 +264,7 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None, usage:
         The exit code: 0, or 2 after a UserError, which is printed on standard error as one line.
     """
     argv = list(sys.argv[1:] if args is None else args)
-    program = os.path.basename(sys.argv[0]) or "aeropend"
+    program = Path(sys.argv[0]).name or "aeropend"
     stop = Stop()
     stop.install()
     try:
@@ -219,7 +330,7 @@ def _readable_parameter_files(argv: list[str], folder: str) -> list[str]:
             continue
         path = argv[at + 1]
         try:
-            with open(path, encoding="utf-8") as file:
+            with Path(path).open(encoding="utf-8") as file:
                 root = yaml.compose(file, Loader=yaml.SafeLoader)
         except OSError as error:
             raise UserError(f"cannot read parameter file '{path}': {error.strerror}") from error
@@ -233,8 +344,9 @@ def _readable_parameter_files(argv: list[str], folder: str) -> list[str]:
             continue
         _check_sections(path, root)
         if _fill_empty(root):
-            argv[at + 1] = os.path.join(folder, f"{at}.yaml")
-            with open(argv[at + 1], "w", encoding="utf-8") as file:
+            copy = Path(folder) / f"{at}.yaml"
+            argv[at + 1] = str(copy)
+            with copy.open("w", encoding="utf-8") as file:
                 yaml.serialize(root, file, Dumper=yaml.SafeDumper)
     return argv
 
@@ -307,14 +419,3 @@ def wait_until(condition: Callable[[], bool], stop: threading.Event, poll_s: flo
         if stop.wait(poll_s):
             return False
     return True
-
-
-def monotonic_to_ros_ns(clock_now_ns: Callable[[], int]) -> int:
-    """Return the offset that turns `time.monotonic_ns()` into a clock's time, ns: the tightest of five readings."""
-    readings = []
-    for _ in range(5):
-        before = time.monotonic_ns()
-        now = clock_now_ns()
-        after = time.monotonic_ns()
-        readings.append((after - before, now - (before + after) // 2))
-    return min(readings)[1]

@@ -1,0 +1,350 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated rig as a ROS 2 node, with the topics, services and rate of the real one.
+
+Time. A thread of its own takes a sample every 2.040 ms, on absolute deadlines. Stamps are the deadlines, not the
+instants at which the thread woke, so they lie on an exact grid. A sample that is taken when the next one is already due
+counts as late; it is published all the same, and the thread catches up back to back. Only when the process stood still
+for more than `BACKLOG` samples are the older ones not published: the rig is moved on through them, so that its time
+stays equal to ROS time, and they count as lost, as on a real rig nobody listened to. When the system clock is set, the
+grid moves by whole periods and a warning says so.
+
+Faster than real time (`speed` not 1), stamps are simulated time, which starts one period after 0, and `/clock` carries
+it before each sample; nothing is ever lost, simulated time runs slower instead.
+
+Every parameter is read at start and fixed while the node runs: a recording belongs to one model.
+"""
+
+import ctypes
+import gc
+import math
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import BatteryState, JointState
+from std_msgs.msg import Float64
+from std_srvs.srv import SetBool, Trigger
+
+from aeropend_sim import interface
+from aeropend_sim.effects import CATALOGUE, PARAMETER_MISMATCH
+from aeropend_sim.parameters import PARAMETERS, PRESETS, SAMPLE_PERIOD, Model, ModelError, from_flat, load, to_flat
+from aeropend_sim.ros import Diagnostics, Setting, UserError, Worker, declare, overrides, read_settings, run, usage
+
+PERIOD_NS = round(SAMPLE_PERIOD * 1e9)
+BACKLOG = 49
+"""How many samples late the thread may be and still publish them all: 100 ms."""
+CLOCK_STEP_NS = 50_000_000
+"""A system clock that is off by more than this has been set."""
+
+SETTINGS = {
+    "preset": Setting("bench", "model that supplies every number not given", choices=PRESETS),
+    "seed": Setting(0, "seed of noise and gusts", low=0, high=2**31 - 1),
+    "speed": Setting(
+        1.0, "simulated over real time; not 1: publishes /clock; 0: as fast as it goes", low=0.0, high=1e3
+    ),
+    "publish_truth": Setting(False, "publish truth/joint_states and truth/armature"),
+}
+
+USAGE = usage(
+    "plant: the simulated aeropendulum. Publishes joint_states and armature at 490.196 Hz, takes duty_command.",
+    SETTINGS,
+    [
+        "plant",
+        "plant --ros-args -p preset:=thesis -p seed:=3",
+        "plant --ros-args --params-file model.yaml -p publish_truth:=true",
+        "plant --ros-args -p model.R_a:=1.2 -p effects.coulomb_friction.accel:=0.8",
+    ],
+    "  model.*, sensing.*, effects.ID.*: the numbers of a model file; a parameter of an effect that is not given takes its"
+    " default\n  effects: " + ", ".join([*CATALOGUE, PARAMETER_MISMATCH]),
+)
+
+
+class Pace:
+    """The absolute deadlines of a periodic thread, and how well it keeps them.
+
+    Args:
+        period_ns: between deadlines, ns of `clock`.
+        backlog: how many periods late a deadline may be met; when later, what is older is given up.
+            None: nothing is given up, the deadlines move instead.
+        clock: monotonic time, ns.
+        sleep: sleeps for seconds.
+    """
+
+    BIN_NS = 10_000
+    BINS = 1000
+
+    def __init__(
+        self,
+        period_ns: int,
+        backlog: int | None,
+        clock: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._period = period_ns
+        self._backlog = backlog
+        self._clock = clock
+        self._sleep = sleep
+        self.deadline = clock()
+        self.late = 0
+        self.lost = 0
+        self.max_lateness_ns = 0
+        self._histogram = [0] * (self.BINS + 1)
+
+    def next(self) -> int:
+        """Sleep to the next deadline and return how many deadlines before it were given up."""
+        self.deadline += self._period
+        wait = self.deadline - self._clock()
+        while wait > 0:
+            self._sleep(wait * 1e-9)
+            wait = self.deadline - self._clock()
+        lateness = -wait
+        given_up = 0
+        if lateness >= self._period:
+            self.late += 1
+            behind = lateness // self._period
+            if self._backlog is None:
+                self.deadline += lateness
+            elif behind > self._backlog:
+                given_up = behind - self._backlog
+                self.deadline += given_up * self._period
+                self.lost += given_up
+        if lateness > self.max_lateness_ns:
+            self.max_lateness_ns = lateness
+        self._histogram[min(lateness // self.BIN_NS, self.BINS)] += 1
+        return given_up
+
+    def percentile_ms(self, share: float) -> float:
+        """Return the lateness that this share of all deadlines stayed below, ms, in steps of 0.01 up to 10."""
+        wanted = share * sum(self._histogram)
+        count = 0
+        for at, number in enumerate(self._histogram):
+            count += number
+            if count >= wanted:
+                return (at + 1) * self.BIN_NS * 1e-6
+        return math.inf
+
+
+class Plant(Node):
+    """The node. See the module's docstring for time, and contract section 1 for topics."""
+
+    def __init__(self) -> None:
+        super().__init__("plant", automatically_declare_parameters_from_overrides=True)
+        given = overrides(self)
+        settings, model = read_parameters(self, given)
+        # imported here: compiling can take seconds, and a signal must already be handled by then
+        from aeropend_sim.rig import Rig  # noqa: PLC0415
+
+        self._rig = Rig(model, settings["seed"])
+        for _ in range(3):  # compiles before the first deadline
+            self._rig.sample(0.1)
+        self._rig.reset()
+        self._speed: float = settings["speed"]
+        self._lock = threading.Lock()  # of the rig and the duty
+        self._duty = 0.0
+        self._enabled = True
+        self._refused = 0
+        self._samples = 0
+        self._clock_steps = 0
+        self._pace: Pace | None = None
+        self._load = (time.monotonic(), time.process_time())
+
+        qos = interface.QOS
+        self._joint_states = self.create_publisher(JointState, interface.JOINT_STATES, qos)
+        self._armature = self.create_publisher(BatteryState, interface.ARMATURE, qos)
+        self._truth = settings["publish_truth"]
+        if self._truth:
+            self._truth_joint_states = self.create_publisher(JointState, interface.TRUTH_JOINT_STATES, qos)
+            self._truth_armature = self.create_publisher(BatteryState, interface.TRUTH_ARMATURE, qos)
+        if self._speed != 1.0:
+            self._clock_publisher = self.create_publisher(Clock, "/clock", qos)
+        self.create_subscription(Float64, interface.DUTY_COMMAND, self._on_duty, qos)
+        self.create_service(SetBool, interface.ENABLE, self._on_enable)
+        self.create_service(Trigger, interface.RESET, self._on_reset)
+        self._diagnostics = Diagnostics(self, self._report, "simulated aeropendulum")
+        effects = ", ".join(model.effects) or "none"
+        self.get_logger().info(f"model {settings['preset']}, effects: {effects}, speed {self._speed:g}")
+        self._worker = Worker(self, self._simulate if self._speed != 1.0 else self._real_time, "samples")
+        self._worker.start()
+
+    def close(self) -> None:
+        """Stop sampling."""
+        self._worker.stop()
+
+    def _real_time(self, end: threading.Event) -> None:
+        _prepare_thread()
+        pace = self._pace = Pace(PERIOD_NS, BACKLOG)
+        to_ros = _monotonic_to_ros_ns()
+        while not end.is_set():
+            given_up = pace.next()
+            if given_up:
+                with self._lock:
+                    for _ in range(given_up):
+                        self._rig.sample(self._duty)
+                self.get_logger().warn(f"stood still: {given_up} samples lost, {pace.lost} in all")
+            self._sample(pace.deadline + to_ros)
+            if self._samples % 490 == 0:
+                step = _monotonic_to_ros_ns() - to_ros
+                if abs(step) > CLOCK_STEP_NS:
+                    periods = round(step / PERIOD_NS)
+                    to_ros += periods * PERIOD_NS
+                    self._clock_steps += 1
+                    self.get_logger().warn(f"the system clock was set: stamps move by {periods * SAMPLE_PERIOD:.3f} s")
+
+    def _simulate(self, end: threading.Event) -> None:
+        _prepare_thread()
+        if self._speed > 0.0:
+            self._pace = Pace(round(PERIOD_NS / self._speed), None)
+        stamp_ns = 0
+        while not end.is_set():
+            if self._pace is not None:
+                self._pace.next()
+            else:
+                time.sleep(0)  # lets the callbacks run
+            stamp_ns += PERIOD_NS
+            self._clock_publisher.publish(Clock(clock=interface.stamp(stamp_ns)))
+            self._sample(stamp_ns)
+
+    def _sample(self, stamp_ns: int) -> None:
+        with self._lock:
+            duty = self._duty
+            measured, truth = self._rig.sample(duty)
+        self._joint_states.publish(interface.joint_states_message(stamp_ns, measured.theta, measured.omega))
+        self._armature.publish(interface.armature_message(stamp_ns, measured.v_a, measured.i_a, duty))
+        if self._truth:
+            self._truth_joint_states.publish(
+                interface.joint_states_message(stamp_ns, truth.theta, truth.omega, truth.theta_dot, truth.rotor_angle)
+            )
+            self._truth_armature.publish(interface.armature_message(stamp_ns, truth.v_a, truth.i_a, duty))
+        self._samples += 1
+
+    def _on_duty(self, message: Float64) -> None:
+        if not math.isfinite(message.data):
+            self._refused += 1
+            if self._refused == 1:
+                self.get_logger().warn(f"duty_command {message.data} refused; further ones are only counted")
+            return
+        # as the 32-bit float that `armature` reports, so that a recording holds exactly what was applied
+        duty = ctypes.c_float(min(max(message.data, 0.0), 1.0)).value
+        with self._lock:
+            if self._enabled:
+                self._duty = duty
+
+    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        with self._lock:
+            self._enabled = request.data
+            if not self._enabled:
+                self._duty = 0.0  # and it stays 0 after enabling, until the next command
+        response.success = True
+        response.message = "enabled" if request.data else "disabled: duty 0"
+        return response
+
+    def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        with self._lock:
+            self._rig.reset()
+            self._duty = 0.0
+        response.success = True
+        response.message = "at rest, duty 0"
+        return response
+
+    def _report(self) -> tuple[str, dict[str, object]]:
+        wall, cpu = time.monotonic(), time.process_time()
+        load = (cpu - self._load[1]) / (wall - self._load[0]) if wall > self._load[0] else 0.0
+        self._load = (wall, cpu)
+        pace = self._pace
+        values: dict[str, object] = {
+            "samples": self._samples,
+            "late ticks": pace.late if pace else 0,
+            "lost ticks": pace.lost if pace else 0,
+            "refused commands": self._refused,
+            "lateness max ms": pace.max_lateness_ns * 1e-6 if pace else 0.0,
+            "lateness p99 ms": pace.percentile_ms(0.99) if pace else 0.0,
+            "clock steps": self._clock_steps,
+            "cpu share": load,
+            "enabled": self._enabled,
+        }
+        return (f"{pace.lost} samples lost" if pace and pace.lost else ""), values
+
+
+def read_parameters(node: Node, given: dict[str, Any]) -> tuple[dict[str, Any], Model]:
+    """Check and declare the node's parameters.
+
+    Args:
+        node: the plant's.
+        given: what was set, by full name.
+
+    Returns:
+        The settings, and the model.
+
+    Raises:
+        UserError: unknown name, wrong type, or out of range.
+    """
+    mine = {name: value for name, value in given.items() if name.split(".")[0] not in ("model", "sensing", "effects")}
+    settings = read_settings(node, SETTINGS, mine)
+    flat = {name: value for name, value in given.items() if name not in mine}
+    try:
+        model = from_flat(_with_defaults(flat), "parameters", load(settings["preset"]))
+    except ModelError as error:
+        raise UserError(str(error)) from error
+    for name, value in to_flat(model).items():
+        declare(node, name, value, _setting(name).descriptor())
+    return settings, model
+
+
+def _with_defaults(flat: dict[str, Any]) -> dict[str, Any]:
+    """Resolve what a parameter file leaves empty: `effects: {}`, and an effect without any of its parameters."""
+    resolved: dict[str, Any] = {}
+    for name, value in flat.items():
+        effect = CATALOGUE.get(name.removeprefix("effects."))
+        if value == "" and name.startswith("effects.") and effect is not None:
+            resolved |= {f"{name}.{key}": parameter.default for key, parameter in effect.parameters.items()}
+        elif value == "" and name in ("model", "sensing", "effects"):
+            continue
+        elif name == "effects":
+            raise UserError(f"parameter effects is {value!r}: give effects by id, as effects: {{gust: {{sigma: 1.5}}}}")
+        else:
+            resolved[name] = value
+    return resolved
+
+
+def _setting(name: str) -> Setting:
+    """Describe one number of a model file, by its full name."""
+    section, _, rest = name.partition(".")
+    if section == "effects":
+        effect, _, key = rest.partition(".")
+        if effect != PARAMETER_MISMATCH:
+            q = CATALOGUE[effect].parameters[key]
+            return Setting(q.default, f"{CATALOGUE[effect].physics}: {q.description}", q.unit, q.low, q.high)
+        name = f"model.{key}"
+    p = PARAMETERS[name]
+    return Setting(p.low, p.description, p.unit, p.low, p.high)
+
+
+def _prepare_thread() -> None:
+    """Keep other threads and the garbage collector from delaying this one."""
+    sys.setswitchinterval(0.0002)
+    gc.collect()
+    gc.freeze()
+
+
+def _monotonic_to_ros_ns() -> int:
+    """Return what turns `time.monotonic_ns()` into system time, ns: the tightest of five readings."""
+    readings = []
+    for _ in range(5):
+        before = time.monotonic_ns()
+        now = time.time_ns()
+        after = time.monotonic_ns()
+        readings.append((after - before, now - (before + after) // 2))
+    return min(readings)[1]
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point of `plant`."""
+    return run(Plant, args, USAGE)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
