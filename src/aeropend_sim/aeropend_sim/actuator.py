@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Duty to voltage to speed to thrust in steady state, and the inverses that the controllers use.
+
+All functions take and return scalars or arrays of one shape, SI units, duty 0..1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Numbers = Mapping[str, float]
+
+
+def voltage(numbers: Numbers, duty: ArrayLike) -> Array:
+    """Voltage (V) that a duty gives: v = max(0, k0 + k1 sqrt(k2 τ + k3)), thesis (4.3)."""
+    duty = np.asarray(duty, dtype=float)
+    return np.maximum(0.0, numbers["k0"] + numbers["k1"] * np.sqrt(numbers["k2"] * duty + numbers["k3"]))
+
+
+def duty(numbers: Numbers, voltage: ArrayLike) -> Array:
+    """Duty that gives a voltage (V), clipped to 0..1; at 0 V and below the duty is 0 (the map's dead zone)."""
+    v = np.asarray(voltage, dtype=float)
+    root = np.maximum(0.0, (v - numbers["k0"]) / numbers["k1"])
+    return np.where(v <= 0.0, 0.0, np.clip((root**2 - numbers["k3"]) / numbers["k2"], 0.0, 1.0))
+
+
+def thrust(numbers: Numbers, speed: ArrayLike) -> Array:
+    """Static thrust (N) of a speed (rad/s): f = k_thrust ω|ω|."""
+    speed = np.asarray(speed, dtype=float)
+    return numbers["k_thrust"] * speed * np.abs(speed)
+
+
+def speed(numbers: Numbers, thrust: ArrayLike) -> Array:
+    """Speed (rad/s) that gives a static thrust (N)."""
+    thrust = np.asarray(thrust, dtype=float)
+    return np.sign(thrust) * np.sqrt(np.abs(thrust) / numbers["k_thrust"])
+
+
+def current_at(numbers: Numbers, speed: ArrayLike) -> Array:
+    """Armature current (A) that holds a speed (rad/s): K_t i = B_m ω + k_load ω|ω|."""
+    speed = np.asarray(speed, dtype=float)
+    return (numbers["B_m"] * speed + numbers["k_load"] * speed * np.abs(speed)) / numbers["K_t"]
+
+
+def voltage_at(numbers: Numbers, speed: ArrayLike) -> Array:
+    """Armature voltage (V) that holds a speed (rad/s): v = R_a i + K_e ω, thesis (3.5) at rest."""
+    speed = np.asarray(speed, dtype=float)
+    return numbers["R_a"] * current_at(numbers, speed) + numbers["K_e"] * speed
+
+
+def speed_at(numbers: Numbers, voltage: ArrayLike) -> Array:
+    """Steady speed (rad/s) of an armature voltage (V >= 0): the inverse of `voltage_at`."""
+    v = np.asarray(voltage, dtype=float)
+    a = numbers["R_a"] * numbers["k_load"] / numbers["K_t"]
+    b = numbers["R_a"] * numbers["B_m"] / numbers["K_t"] + numbers["K_e"]
+    return 2.0 * v / (b + np.sqrt(b * b + 4.0 * a * np.maximum(v, 0.0)))
+
+
+def acting_voltage(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, float]],
+                   period: float, start: int = 0, before: float = 0.0) -> Array:
+    """Voltage at the bridge over each hold of a duty series, with the effects that need no state.
+
+    A delay that is not a whole number of periods is shared between two holds in proportion, so that the volt-seconds
+    are right. `supply_sag` needs the current and is in `dynamics`.
+
+    Args:
+        numbers: the model's numbers.
+        duty: (N,) duty held over [t_k, t_{k+1}).
+        effects: the active effects.
+        period: s.
+        start: index of the first sample since the supply was fresh.
+        before: duty that acted before the first sample.
+
+    Returns:
+        (N,) V.
+    """
+    v = voltage(numbers, duty)
+    if "supply_drift" in effects:
+        time = (start + np.arange(len(duty))) * period
+        v = v * np.maximum(0.0, 1.0 - effects["supply_drift"]["rate"] * time)
+    if "bridge_drop" in effects:
+        v = np.maximum(0.0, v - effects["bridge_drop"]["v_drop"])
+    if "command_delay" in effects:
+        whole, part = divmod(effects["command_delay"]["delay"] / period, 1.0)
+        late = np.concatenate([np.full(int(whole) + 1, float(voltage(numbers, before))), v])
+        v = (1.0 - part) * late[1:len(v) + 1] + part * late[:len(v)]
+    return v
+
+
+def static_angle(numbers: Numbers, duty: ArrayLike) -> Array:
+    """Angle (rad) at which a duty holds the arm; NaN where the thrust exceeds the arm's weight."""
+    f = thrust(numbers, speed_at(numbers, voltage(numbers, duty)))
+    with np.errstate(invalid="ignore"):
+        return np.arcsin(numbers["L_over_J"] * f / numbers["mgd_over_J"])

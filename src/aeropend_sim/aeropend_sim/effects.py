@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The catalogue of effects that a nominal model can miss: one entry an effect.
+
+To add one: an entry here, its term in `actuator.py`, `dynamics.py` or `sensing.py`, and its row in the README.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+PLACES = ("actuator", "electrical", "rotor", "thrust", "arm", "sensing")
+"""The chain from the duty to the reading, in the direction of cause."""
+
+PARAMETER_MISMATCH = "parameter_mismatch"
+"""The effect whose parameters are the model's own numbers, by their model-file names, and their new values."""
+
+
+@dataclass(frozen=True)
+class EffectParameter:
+    """One number of an effect: at `neutral` the effect is absent; `default` is a size worth finding on `bench`."""
+
+    unit: str
+    neutral: float
+    default: float
+    low: float
+    high: float
+    description: str
+
+
+@dataclass(frozen=True)
+class Effect:
+    """An effect: where in the chain it lives, its physics in one line, and its parameters.
+
+    The first parameter is the size: at its neutral value the effect is absent whatever the others are.
+    """
+
+    id: str
+    place: str
+    physics: str
+    parameters: dict[str, EffectParameter]
+
+    @property
+    def size(self) -> str:
+        """Name of the parameter that measures how large the effect is."""
+        return next(iter(self.parameters))
+
+
+P = EffectParameter
+
+_ENTRIES = (
+    Effect("bridge_drop", "actuator", "the H-bridge takes a constant voltage: v = max(0, map(τ) - v_drop)",
+           {"v_drop": P("V", 0.0, 0.2, 0.0, 2.0, "voltage lost in the bridge")}),
+    Effect("supply_sag", "actuator", "the supply yields under load: v = map(τ) - r_supply i",
+           {"r_supply": P("Ω", 0.0, 0.15, 0.0, 5.0, "internal resistance of the supply")}),
+    Effect("supply_drift", "actuator", "the battery empties: v = map(τ)(1 - rate t)",
+           {"rate": P("1/s", 0.0, 2e-3, -0.02, 0.02, "relative loss of voltage per second")}),
+    Effect("command_delay", "actuator", "the duty applied acts later",
+           {"delay": P("s", 0.0, 0.03, 0.0, 0.5, "time from the duty to its effect")}),
+    Effect("brush_drop", "electrical", "the brushes take v_brush tanh(i/0.02) of the armature voltage",
+           {"v_brush": P("V", 0.0, 0.12, 0.0, 1.0, "voltage over the brushes")}),
+    Effect("winding_heating", "electrical", "the winding warms: R = R_a (1 + gain T), Ṫ = i² - T/tau",
+           {"gain": P("1/A²s", 0.0, 0.02, 0.0, 0.5, "relative rise of resistance per A²s"),
+            "tau": P("s", 30.0, 30.0, 1.0, 600.0, "time constant of cooling")}),
+    Effect("rotor_friction", "rotor", "Coulomb torque on the rotor, with sticking",
+           {"torque": P("N·m", 0.0, 5e-4, 0.0, 2e-2, "friction torque")}),
+    Effect("thrust_lag", "thrust", "the air takes time to follow: ḟ = (f_static - f)/tau",
+           {"tau": P("s", 0.0, 0.08, 0.0, 1.0, "time constant of the thrust")}),
+    Effect("thrust_exponent", "thrust", "thrust is not square in speed: f = k_thrust ω_0² (ω/ω_0)^n, ω_0 = 150 rad/s",
+           {"n": P("-", 2.0, 1.8, 1.0, 3.0, "exponent of the speed")}),
+    Effect("axial_inflow", "thrust", "a rotor that moves along its axis pulls less: f - k ω θ̇",
+           {"k": P("N·s²/rad²", 0.0, 1e-4, 0.0, 2e-3, "loss of thrust per speed and angular rate")}),
+    Effect("ground_effect", "thrust", "more thrust near the rest position: f (1 + gain exp(-|θ|/width))",
+           {"gain": P("-", 0.0, 0.25, -0.9, 3.0, "relative rise of thrust at θ = 0"),
+            "width": P("rad", 0.3, 0.3, 0.02, 2.0, "angle over which it fades")}),
+    Effect("coulomb_friction", "arm", "dry friction in the pivot, with sticking, torque over inertia",
+           {"accel": P("rad/s²", 0.0, 0.8, 0.0, 20.0, "friction torque over the arm's inertia")}),
+    Effect("quadratic_drag", "arm", "air drag of the arm: - k θ̇|θ̇|",
+           {"k": P("1/rad", 0.0, 0.6, 0.0, 20.0, "drag over the arm's inertia")}),
+    Effect("cable_torque", "arm", "the cable is a spring: - k (θ - theta0)",
+           {"k": P("1/s²", 0.0, 4.0, -20.0, 60.0, "stiffness over the arm's inertia"),
+            "theta0": P("rad", 0.0, 0.4, -2.0, 2.0, "angle at which the cable is slack")}),
+    Effect("mast_flex", "arm", "the mast swings: q̈ + 2 zeta omega q̇ + omega² q = -coupling θ̈, acting back with -q̈",
+           {"coupling": P("-", 0.0, 0.15, 0.0, 0.9, "share of the arm's inertia that the mode moves"),
+            "omega": P("rad/s", 25.0, 25.0, 3.0, 300.0, "natural frequency of the mode"),
+            "zeta": P("-", 0.03, 0.03, 0.001, 1.0, "damping ratio of the mode")}),
+    Effect("gust", "arm", "coloured random torque over inertia (first-order Gauss-Markov)",
+           {"sigma": P("rad/s²", 0.0, 1.5, 0.0, 50.0, "standard deviation"),
+            "tau": P("s", 0.3, 0.3, 0.005, 30.0, "correlation time")}),
+    Effect("angle_offset", "sensing", "θ + bias is read (an offset centre of mass looks the same)",
+           {"bias": P("rad", 0.0, 0.06, -1.0, 1.0, "angle read at rest")}),
+    Effect("encoder_lag", "sensing", "the angle filter is slower than the model file says",
+           {"tau": P("s", 0.0, 0.03, 0.0, 0.5, "what is added to each stage of the filter")}),
+    Effect("encoder_eccentricity", "sensing", "the magnet sits off the axis: θ + amplitude sin(θ + phase) is read",
+           {"amplitude": P("rad", 0.0, 0.06, 0.0, 0.5, "amplitude of the error"),
+            "phase": P("rad", 0.5, 0.5, -math.pi, math.pi, "direction of the offset")}),
+    Effect("current_gain", "sensing", "i (1 + gain) is read",
+           {"gain": P("-", 0.0, 0.15, -0.9, 3.0, "relative error of the reading")}),
+    Effect("current_offset", "sensing", "i + bias is read",
+           {"bias": P("A", 0.0, 0.06, -2.0, 2.0, "current read at zero")}),
+    Effect("voltage_offset", "sensing", "v + bias is read",
+           {"bias": P("V", 0.0, 0.1, -3.0, 3.0, "voltage read at zero")}),
+    Effect("speed_spikes", "sensing", "false capture periods: outliers in ω",
+           {"rate": P("1/s", 0.0, 2.0, 0.0, 100.0, "mean number of false periods per second")}),
+)
+
+CATALOGUE: dict[str, Effect] = {entry.id: entry for entry in _ENTRIES}
+"""Every effect but `parameter_mismatch`, by id, in the order of the chain."""
+
+SPIKE_FACTOR = (1.3, 4.0)
+"""A false capture period is too short: the speed read is this many times the true one, uniform between the two."""
+
+_FIELDS = {f"{effect.id}_{name}": parameter.neutral
+           for effect in _ENTRIES for name, parameter in effect.parameters.items()}
+
+Values = NamedTuple("Values", [(name, float) for name in _FIELDS])  # type: ignore[misc]
+"""Every parameter of every effect as `<id>_<parameter>`: what the compiled equations read."""
+
+
+def is_active(effect_id: str, parameters: dict[str, float]) -> bool:
+    """Whether an effect with these parameters differs from the nominal model."""
+    effect = CATALOGUE[effect_id]
+    return parameters[effect.size] != effect.parameters[effect.size].neutral
+
+
+def values(effects: dict[str, dict[str, float]]) -> Values | None:
+    """Flatten active effects for the compiled equations; None when none is active.
+
+    Args:
+        effects: effect id -> parameter name -> value, complete (see `parameters.from_flat`).
+    """
+    active = {id_: p for id_, p in effects.items() if id_ in CATALOGUE and is_active(id_, p)}
+    if not active:
+        return None
+    flat = {f"{id_}_{name}": float(value) for id_, p in active.items() for name, value in p.items()}
+    return Values(**{**_FIELDS, **flat})
