@@ -23,6 +23,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, JointState
@@ -58,7 +59,7 @@ USAGE = usage(
         "plant --ros-args --params-file model.yaml -p publish_truth:=true",
         "plant --ros-args -p model.R_a:=1.2 -p effects.coulomb_friction.accel:=0.8",
     ],
-    "  model.*, sensing.*, effects.ID.*: the numbers of a model file; a parameter of an effect that is not given takes its"
+    "  model.*, sensing.*, effects.ID.*: the numbers of a model file; what an effect is not given takes its"
     " default\n  effects: " + ", ".join([*CATALOGUE, PARAMETER_MISMATCH]),
 )
 
@@ -139,8 +140,7 @@ class Plant(Node):
         from aeropend_sim.rig import Rig  # noqa: PLC0415
 
         self._rig = Rig(model, settings["seed"])
-        for _ in range(3):  # compiles before the first deadline
-            self._rig.sample(0.1)
+        self._rig.run(np.zeros(1))  # compiles before the first deadline
         self._rig.reset()
         self._speed: float = settings["speed"]
         self._lock = threading.Lock()  # of the rig and the duty
@@ -182,8 +182,8 @@ class Plant(Node):
             given_up = pace.next()
             if given_up:
                 with self._lock:
-                    for _ in range(given_up):
-                        self._rig.sample(self._duty)
+                    for done in range(0, given_up, 10_000):  # bounds the memory
+                        self._rig.run(np.full(min(given_up - done, 10_000), self._duty))
                 self.get_logger().warn(f"stood still: {given_up} samples lost, {pace.lost} in all")
             self._sample(pace.deadline + to_ros)
             if self._samples % 490 == 0:
@@ -211,14 +211,16 @@ class Plant(Node):
     def _sample(self, stamp_ns: int) -> None:
         with self._lock:
             duty = self._duty
-            measured, truth = self._rig.sample(duty)
-        self._joint_states.publish(interface.joint_states_message(stamp_ns, measured.theta, measured.omega))
-        self._armature.publish(interface.armature_message(stamp_ns, measured.v_a, measured.i_a, duty))
+            reading, state = self._rig.run(np.array([duty]))
+        theta, omega, i_a, v_a = reading[:, 0].tolist()
+        self._joint_states.publish(interface.joint_states_message(stamp_ns, theta, omega))
+        self._armature.publish(interface.armature_message(stamp_ns, v_a, i_a, duty))
         if self._truth:
+            theta, theta_dot, i_a, omega, v_a, rotor_angle, _ = state[:, 0].tolist()
             self._truth_joint_states.publish(
-                interface.joint_states_message(stamp_ns, truth.theta, truth.omega, truth.theta_dot, truth.rotor_angle)
+                interface.joint_states_message(stamp_ns, theta, omega, theta_dot, rotor_angle)
             )
-            self._truth_armature.publish(interface.armature_message(stamp_ns, truth.v_a, truth.i_a, duty))
+            self._truth_armature.publish(interface.armature_message(stamp_ns, v_a, i_a, duty))
         self._samples += 1
 
     def _on_duty(self, message: Float64) -> None:
