@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Package set-up, for colcon and pip alike."""
 
-from glob import glob
-
 from setuptools import find_packages, setup
 
 PACKAGE = "aeropend_sim"
@@ -15,7 +13,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
-        (f"share/{PACKAGE}/config", glob("aeropend_sim/config/*.yaml")),
+        (f"share/{PACKAGE}/config", ["aeropend_sim/config/bench.yaml", "aeropend_sim/config/thesis.yaml"]),
     ],
     install_requires=["numba", "numpy", "PyYAML", "scipy"],
     extras_require={"test": ["pytest", "pytest-timeout"]},
@@ -23,7 +21,7 @@ setup(
     zip_safe=False,
     maintainer="aeropend maintainers",
     maintainer_email="maintainers@aeropend.example",
-    description="The aeropendulum's model (dynamics, actuator, sensing, the catalogue of effects) and the simulated plant node.",
+    description="The aeropendulum's model (dynamics, actuator, sensing, effects) and the simulated plant node.",
     license="Apache-2.0",
     entry_points={"console_scripts": ["plant = aeropend_sim.plant:main"]},
 )
