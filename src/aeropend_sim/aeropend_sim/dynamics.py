@@ -376,28 +376,29 @@ def arm_with_dry_friction(y: float, yd: float, q: float, qd: float, f0: float, f
 
 
 @equation
-def advance(state: State, v: float, noise: float, c: Coefficients, e: Values | None, x: Extra | None
-            ) -> State:
-    """The whole plant over one hold.
-
-    Args:
-        state: at the start.
-        v: voltage at the bridge, held (`actuator.acting_voltage`).
-        noise: standard normal number that drives `gust`.
-        c: coefficients; e, x: effects, or None twice for the nominal plant.
-    """
+def advance_motor(state: State, v: float, c: Coefficients, e: Values | None, x: Extra | None
+                  ) -> tuple[float, float, float, float, float]:
+    """Winding and rotor over one hold of v: current, speed at h/2 and h, angle turned, heat."""
     i0, w0 = state.i_a, state.omega
     im, i1, wm, w1 = winding_rotor(i0, w0, v, state.heat, c, e, x)
     angle = state.rotor_angle + c.h * (1.0 / 6.0) * (w0 + 4.0 * wm + w1)
+    heat = 0.0
+    if e is not None and e.winding_heating_gain > 0.0:
+        k = x.cooling
+        heat = k.decay * state.heat + k.w0 * i0 * i0 + k.w1 * im * im + k.w2 * i1 * i1
+    return i1, wm, w1, angle, heat
+
+
+@equation
+def advance_arm(state: State, wm: float, w1: float, noise: float, c: Coefficients, e: Values | None, x: Extra | None
+                ) -> tuple[float, float, float, float, float, float]:
+    """Air and arm over one hold, for the speed at 0 (in the state), h/2 and h: θ, θ̇, thrust, q, q̇, gust."""
+    w0, y, yd = state.omega, state.theta, state.theta_dot
     fm, f1 = static_thrust(wm, c, e), static_thrust(w1, c, e)
     if e is None:
         f0 = static_thrust(w0, c, e)
-        y, yd, _, _ = arm(state.theta, state.theta_dot, 0.0, 0.0, f0, fm, f1, w0, wm, w1, 0.0, 0.0, c, e, x)
-        return State(i1, w1, angle, y, yd, f1, 0.0, 0.0, 0.0, 0.0)
-    heat = 0.0
-    if e.winding_heating_gain > 0.0:
-        k = x.cooling
-        heat = k.decay * state.heat + k.w0 * i0 * i0 + k.w1 * im * im + k.w2 * i1 * i1
+        y, yd, _, _ = arm(y, yd, 0.0, 0.0, f0, fm, f1, w0, wm, w1, 0.0, 0.0, c, e, x)
+        return y, yd, f1, 0.0, 0.0, 0.0
     f0 = state.thrust
     if e.thrust_lag_tau > 0.0:
         k = x.air
@@ -407,11 +408,25 @@ def advance(state: State, v: float, noise: float, c: Coefficients, e: Values | N
                   k.decay * f0 + k.w0 * s0 + k.w1 * sm + k.w2 * s1)
     q, qd = state.flex, state.flex_dot
     if e.coulomb_friction_accel > 0.0:
-        y, yd, q, qd = arm_with_dry_friction(state.theta, state.theta_dot, q, qd, f0, fm, f1, w0, wm, w1,
-                                             state.gust, c, e, x)
+        y, yd, q, qd = arm_with_dry_friction(y, yd, q, qd, f0, fm, f1, w0, wm, w1, state.gust, c, e, x)
     else:
-        y, yd, q, qd = arm(state.theta, state.theta_dot, q, qd, f0, fm, f1, w0, wm, w1, 0.0, state.gust, c, e, x)
-    gust = x.gust_decay * state.gust + x.gust_kick * noise
+        y, yd, q, qd = arm(y, yd, q, qd, f0, fm, f1, w0, wm, w1, 0.0, state.gust, c, e, x)
+    return y, yd, f1, q, qd, x.gust_decay * state.gust + x.gust_kick * noise
+
+
+@equation
+def advance(state: State, v: float, noise: float, c: Coefficients, e: Values | None, x: Extra | None) -> State:
+    """The whole plant over one hold.
+
+    Args:
+        state: at the start.
+        v: voltage at the bridge, held (`actuator.acting_voltage`).
+        noise: standard normal number that drives `gust`.
+        c: coefficients.
+        e: effects, and x, their coefficients; None twice for the nominal plant.
+    """
+    i1, wm, w1, angle, heat = advance_motor(state, v, c, e, x)
+    y, yd, f1, q, qd, gust = advance_arm(state, wm, w1, noise, c, e, x)
     return State(i1, w1, angle, y, yd, f1, heat, q, qd, gust)
 
 
@@ -467,7 +482,27 @@ def run(v: Array, noise: Array, state: State, c: Coefficients, e: Values | None,
     return state
 
 
-_NO_NOISE = np.zeros(0)
+@njit(cache=True, fastmath={"contract"})
+def run_arm(speed: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
+    """Air and arm alone, for a given speed (N,), linear between samples; fills out (2, N) with θ, θ̇."""
+    for k in range(speed.shape[0]):
+        out[0, k], out[1, k] = state.theta, state.theta_dot
+        w0 = speed[k]
+        w1 = speed[min(k + 1, speed.shape[0] - 1)]
+        now = State(0.0, w0, 0.0, state.theta, state.theta_dot, state.thrust, 0.0, state.flex, state.flex_dot, 0.0)
+        y, yd, f1, q, qd, _ = advance_arm(now, 0.5 * (w0 + w1), w1, 0.0, c, e, x)
+        state = State(0.0, w1, 0.0, y, yd, f1, 0.0, q, qd, 0.0)
+    return state
+
+
+@njit(cache=True, fastmath={"contract"})
+def run_motor(v: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
+    """Winding and rotor alone, for the voltage at the terminals (N,), held; fills out (3, N) with i_a, ω, angle."""
+    for k in range(v.shape[0]):
+        out[0, k], out[1, k], out[2, k] = state.i_a, state.omega, state.rotor_angle
+        i1, _, w1, angle, heat = advance_motor(state, v[k], c, e, x)
+        state = State(i1, w1, angle, 0.0, 0.0, 0.0, heat, 0.0, 0.0, 0.0)
+    return state
 
 
 def simulate(model: Model, duty: Array, period: float = SAMPLE_PERIOD, state: State | None = None,
