@@ -17,10 +17,13 @@ Every parameter is read at start and fixed while the node runs: a recording belo
 import ctypes
 import gc
 import math
+import os
 import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -69,8 +72,7 @@ class Pace:
 
     Args:
         period_ns: between deadlines, ns of `clock`.
-        backlog: how many periods late a deadline may be met; when later, what is older is given up.
-            None: nothing is given up, the deadlines move instead.
+        backlog: how many periods late a deadline may be met; older ones are given up.
         clock: monotonic time, ns.
         sleep: sleeps for seconds.
     """
@@ -81,7 +83,7 @@ class Pace:
     def __init__(
         self,
         period_ns: int,
-        backlog: int | None,
+        backlog: int,
         clock: Callable[[], int] = time.monotonic_ns,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
@@ -91,7 +93,6 @@ class Pace:
         self._sleep = sleep
         self.deadline = clock()
         self.late = 0
-        self.lost = 0
         self.max_lateness_ns = 0
         self._histogram = [0] * (self.BINS + 1)
 
@@ -106,13 +107,8 @@ class Pace:
         given_up = 0
         if lateness >= self._period:
             self.late += 1
-            behind = lateness // self._period
-            if self._backlog is None:
-                self.deadline += lateness
-            elif behind > self._backlog:
-                given_up = behind - self._backlog
-                self.deadline += given_up * self._period
-                self.lost += given_up
+            given_up = max(0, lateness // self._period - self._backlog)
+            self.deadline += given_up * self._period
         if lateness > self.max_lateness_ns:
             self.max_lateness_ns = lateness
         self._histogram[min(lateness // self.BIN_NS, self.BINS)] += 1
@@ -137,7 +133,7 @@ class Plant(Node):
         given = overrides(self)
         settings, model = read_parameters(self, given)
         # imported here: compiling can take seconds, and a signal must already be handled by then
-        from aeropend_sim.rig import Rig  # noqa: PLC0415
+        from aeropend_sim.rig import Rig
 
         self._rig = Rig(model, settings["seed"])
         self._rig.run(np.zeros(1))  # compiles before the first deadline
@@ -148,6 +144,7 @@ class Plant(Node):
         self._enabled = True
         self._refused = 0
         self._samples = 0
+        self._lost = 0
         self._clock_steps = 0
         self._pace: Pace | None = None
         self._load = (time.monotonic(), time.process_time())
@@ -176,15 +173,17 @@ class Plant(Node):
 
     def _real_time(self, end: threading.Event) -> None:
         _prepare_thread()
+        _go_before_other_programs()
         pace = self._pace = Pace(PERIOD_NS, BACKLOG)
         to_ros = _monotonic_to_ros_ns()
         while not end.is_set():
             given_up = pace.next()
             if given_up:
+                self._lost += given_up
                 with self._lock:
                     for done in range(0, given_up, 10_000):  # bounds the memory
                         self._rig.run(np.full(min(given_up - done, 10_000), self._duty))
-                self.get_logger().warn(f"stood still: {given_up} samples lost, {pace.lost} in all")
+                self.get_logger().warn(f"stood still: {given_up} samples lost, {self._lost} in all")
             self._sample(pace.deadline + to_ros)
             if self._samples % 490 == 0:
                 step = _monotonic_to_ros_ns() - to_ros
@@ -197,7 +196,7 @@ class Plant(Node):
     def _simulate(self, end: threading.Event) -> None:
         _prepare_thread()
         if self._speed > 0.0:
-            self._pace = Pace(round(PERIOD_NS / self._speed), None)
+            self._pace = Pace(round(PERIOD_NS / self._speed), BACKLOG)
         stamp_ns = 0
         while not end.is_set():
             if self._pace is not None:
@@ -260,7 +259,7 @@ class Plant(Node):
         values: dict[str, object] = {
             "samples": self._samples,
             "late ticks": pace.late if pace else 0,
-            "lost ticks": pace.lost if pace else 0,
+            "lost ticks": self._lost,
             "refused commands": self._refused,
             "lateness max ms": pace.max_lateness_ns * 1e-6 if pace else 0.0,
             "lateness p99 ms": pace.percentile_ms(0.99) if pace else 0.0,
@@ -268,7 +267,7 @@ class Plant(Node):
             "cpu share": load,
             "enabled": self._enabled,
         }
-        return (f"{pace.lost} samples lost" if pace and pace.lost else ""), values
+        return (f"{self._lost} samples lost" if self._lost else ""), values
 
 
 def read_parameters(node: Node, given: dict[str, Any]) -> tuple[dict[str, Any], Model]:
@@ -330,6 +329,17 @@ def _prepare_thread() -> None:
     sys.setswitchinterval(0.0002)
     gc.collect()
     gc.freeze()
+
+
+def _go_before_other_programs() -> None:
+    """Ask for real-time priority, which root has, and others with a limit on rtprio; without it, do with what there is.
+
+    Every thread of the process needs it: one that holds a lock the sampling thread waits for would else itself wait for
+    other programs.
+    """
+    with suppress(OSError):
+        for thread in Path("/proc/self/task").iterdir():
+            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(1))
 
 
 def _monotonic_to_ros_ns() -> int:

@@ -264,7 +264,7 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None, usage:
         The exit code: 0, or 2 after a UserError, which is printed on standard error as one line.
     """
     argv = list(sys.argv[1:] if args is None else args)
-    program = Path(sys.argv[0]).name or "aeropend"
+    program = Path(sys.argv[0]).stem or "aeropend"
     stop = Stop()
     stop.install()
     try:
