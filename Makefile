@@ -42,7 +42,7 @@ lint: .venv/.dev ## check style and types
 
 clean: ## remove what building and testing left
 	rm -rf build install log .mypy_cache .pytest_cache .ruff_cache src/*/build src/*/*.egg-info
-	find src test -name __pycache__ -type d -prune -exec rm -rf {} +
+	find . -path ./.venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean ## remove .venv too
 	rm -rf .venv
