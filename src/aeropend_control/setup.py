@@ -13,7 +13,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
     ],
-    install_requires=["aeropend-sim", "numpy", "scipy"],
+    install_requires=["numpy", "rich", "scipy"],
     extras_require={"test": ["pytest", "pytest-timeout"]},
     python_requires=">=3.10",
     zip_safe=False,

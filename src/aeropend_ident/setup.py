@@ -14,7 +14,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
     ],
-    install_requires=["aeropend-sim", "Jinja2", "mcap", "numba", "numpy", "PyYAML", "rich", "rosbags", "scipy"],
+    install_requires=["Jinja2", "lz4", "numba", "numpy", "PyYAML", "rich", "rosbags", "scipy"],
     extras_require={"test": ["pytest", "pytest-timeout"]},
     python_requires=">=3.10",
     zip_safe=False,

@@ -15,7 +15,7 @@ setup(
         (f"share/{PACKAGE}", ["package.xml"]),
         (f"share/{PACKAGE}/config", ["aeropend_sim/config/bench.yaml", "aeropend_sim/config/thesis.yaml"]),
     ],
-    install_requires=["numba", "numpy", "PyYAML", "scipy"],
+    install_requires=["numba", "numpy", "PyYAML"],
     extras_require={"test": ["pytest", "pytest-timeout"]},
     python_requires=">=3.10",
     zip_safe=False,
