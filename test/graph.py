@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Real node processes for the tests, and a node of the tests' own that listens to them."""
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.experimental import EventsExecutor
+from rclpy.node import Node
+
+from aeropend_sim import interface
+
+MODULES = {
+    "plant": "aeropend_sim.plant",
+    "excite": "aeropend_control.excite",
+    "record": "aeropend_ident.record",
+    "replay": "aeropend_ident.replay",
+    "diagnose": "aeropend_ident.diagnose",
+}
+PATIENCE_S = 30.0
+"""How long a test waits for what must come: discovery takes seconds on a loaded machine."""
+
+
+def isolate() -> None:
+    """Keep this process and those it starts on this machine and in a domain of their own."""
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ["ROS_DOMAIN_ID"] = str(os.getpid() % 102)
+    os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="aeropend_log_")
+
+
+class Process:
+    """A command in a process of its own; its output goes to one file.
+
+    Args:
+        name: a key of MODULES.
+        args: its arguments.
+    """
+
+    def __init__(self, name: str, *args: str) -> None:
+        self._output = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
+        self.popen = subprocess.Popen(
+            [sys.executable, "-m", MODULES[name], *args], stdout=self._output, stderr=subprocess.STDOUT
+        )
+
+    @property
+    def output(self) -> str:
+        """What it has printed so far, standard output and error together."""
+        self._output.seek(0)
+        return self._output.read().decode()
+
+    def wait_for(self, text: str) -> "Process":
+        """Wait until it has printed this text, and return the process."""
+        end = time.monotonic() + PATIENCE_S
+        while text not in self.output:
+            assert self.popen.poll() is None, f"ended with {self.popen.returncode}: {self.output}"
+            assert time.monotonic() < end, f"'{text}' never came: {self.output}"
+            time.sleep(0.02)
+        return self
+
+    def send(self, number: signal.Signals) -> "Process":
+        """Send a signal."""
+        self.popen.send_signal(number)
+        return self
+
+    def wait(self, timeout: float = PATIENCE_S) -> int:
+        """Wait for the end and return the exit code."""
+        return self.popen.wait(timeout)
+
+    def stop(self) -> int:
+        """End it as Ctrl-C does and return the exit code; kill it when it does not."""
+        if self.popen.poll() is None:
+            self.popen.send_signal(signal.SIGCONT)
+            self.popen.send_signal(signal.SIGINT)
+        try:
+            return self.popen.wait(PATIENCE_S)
+        finally:
+            self.popen.kill()
+            self.popen.wait()
+
+
+def parameters(**values: object) -> list[str]:
+    """Return the ROS arguments that set these parameters; `__` in a name stands for a dot."""
+    args = ["--ros-args"]
+    for name, value in values.items():
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        args += ["-p", f"{name.replace('__', '.')}:={text}"]
+    return args
+
+
+class Graph:
+    """The tests' own node."""
+
+    def __init__(self) -> None:
+        rclpy.init(args=[])
+        self.node = Node("test")
+        self._executor = EventsExecutor()
+        self._executor.add_node(self.node)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown()
+
+    def until(self, condition: Callable[[], Any], what: str) -> Any:
+        """Spin until a condition holds, and return it."""
+        end = time.monotonic() + PATIENCE_S
+        while not (result := condition()):
+            assert time.monotonic() < end, f"waited {PATIENCE_S:.0f} s for {what}"
+            self._executor.spin_once(timeout_sec=0.02)
+        return result
+
+    @contextmanager
+    def listening(self, kind: type, topic: str) -> Iterator[list[Any]]:
+        """Collect the messages of a topic, from when its publisher is known."""
+        messages: list[Any] = []
+        subscription = self.node.create_subscription(kind, topic, messages.append, interface.QOS)
+        try:
+            self.until(lambda: self.node.count_publishers(topic), f"a publisher of {topic}")
+            yield messages
+        finally:
+            self.node.destroy_subscription(subscription)
+
+    @contextmanager
+    def talking(self, kind: type, topic: str) -> Iterator[Callable[[Any], None]]:
+        """Publish on a topic, from when somebody listens."""
+        publisher = self.node.create_publisher(kind, topic, interface.QOS)
+        try:
+            self.until(publisher.get_subscription_count, f"a subscriber of {topic}")
+            yield publisher.publish
+        finally:
+            self.node.destroy_publisher(publisher)
+
+    def call(self, kind: type, service: str, request: Any) -> Any:
+        """Call a service and return its response."""
+        client = self.node.create_client(kind, service)
+        try:
+            self.until(client.service_is_ready, f"service {service}")
+            future = client.call_async(request)
+            self.until(future.done, f"an answer of {service}")
+            return future.result()
+        finally:
+            self.node.destroy_client(client)
+
+    def diagnostics(self, name: str, enough: Callable[[dict[str, str]], bool] = bool) -> dict[str, str]:
+        """Return the counters of a node, once they are enough."""
+        with self.listening(DiagnosticArray, interface.DIAGNOSTICS) as messages:
+
+            def find() -> dict[str, str] | None:
+                for message in messages:
+                    for status in message.status:
+                        values = {value.key: value.value for value in status.values}
+                        if status.name == name and enough(values):
+                            return values
+                return None
+
+            return self.until(find, f"diagnostics of {name}")
+
+
+def stamps(messages: Sequence[Any]) -> list[int]:
+    """Return the header stamps of messages, ns."""
+    return [interface.stamp_ns(message.header.stamp) for message in messages]
