@@ -78,17 +78,21 @@ def acting_voltage(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[
     Returns:
         (N,) V.
     """
-    v = voltage(numbers, duty)
-    if "supply_drift" in effects:
-        time = (start + np.arange(len(duty))) * period
-        v = v * np.maximum(0.0, 1.0 - effects["supply_drift"]["rate"] * time)
-    if "bridge_drop" in effects:
-        v = np.maximum(0.0, v - effects["bridge_drop"]["v_drop"])
-    if "command_delay" in effects:
-        whole, part = divmod(effects["command_delay"]["delay"] / period, 1.0)
-        late = np.concatenate([np.full(int(whole) + 1, float(voltage(numbers, before))), v])
-        v = (1.0 - part) * late[1:len(v) + 1] + part * late[:len(v)]
-    return v
+    n = len(duty)
+    time = (start + np.arange(n)) * period
+
+    def at_bridge(v: Array) -> Array:
+        if "supply_drift" in effects:
+            v = v * np.maximum(0.0, 1.0 - effects["supply_drift"]["rate"] * time)
+        if "bridge_drop" in effects:
+            v = np.maximum(0.0, v - effects["bridge_drop"]["v_drop"])
+        return v
+
+    if "command_delay" not in effects:
+        return at_bridge(voltage(numbers, duty))
+    whole, part = divmod(effects["command_delay"]["delay"] / period, 1.0)
+    late = voltage(numbers, np.concatenate([np.full(int(whole) + 1, before), duty]))
+    return (1.0 - part) * at_bridge(late[1:n + 1]) + part * at_bridge(late[:n])
 
 
 def static_angle(numbers: Numbers, duty: ArrayLike) -> Array:

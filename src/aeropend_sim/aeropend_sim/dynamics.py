@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The equations of the plant, once: nominal and with every effect, for one hold of the input at a time.
 
-The chain is advanced in the direction of cause: winding and rotor (which act on each other), air, arm. Winding, rotor and
-air are first-order lags, advanced exactly for an input that is quadratic over the hold (exponential time differencing,
-Cox & Matthews 2002); the arm by the fourth-order Runge-Kutta-Nyström method. So a hold as long as the electrical time
-constant costs no accuracy, and no inner steps.
+The chain is advanced in the direction of cause: winding and rotor (which act on each other), air, arm. Winding, rotor
+and air are first-order lags, advanced exactly for an input that is quadratic over the hold (exponential time
+differencing, Cox & Matthews 2002); the arm by the fourth-order Runge-Kutta-Nyström method. So a hold as long as the
+electrical time constant costs no accuracy. A longer hold, or that of a faster plant, is cut into equal steps.
 
 `Values` of effects are passed as None for the nominal model: numba then compiles the equations without them.
 
@@ -22,7 +22,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from aeropend_sim import actuator
-from aeropend_sim.effects import Values, values
+from aeropend_sim.effects import PARAMETER_MISMATCH, Values, is_active, values
 from aeropend_sim.parameters import SAMPLE_PERIOD, Model
 
 Array = NDArray[np.float64]
@@ -38,6 +38,12 @@ ROUND = 6755399441055744.0
 
 BRUSH_CURRENT = 0.02
 """A over which the brush drop turns from one sign to the other (contract section 4)."""
+
+LONGEST_STEP = 2.5e-3
+"""s: one step over a longer hold would miss more than 2e-5 of the range of `bench`."""
+
+MOST_STEPS = 1000
+"""Steps that a hold is cut into at most, however fast the numbers say that the plant is."""
 
 
 class Lag(NamedTuple):
@@ -84,8 +90,9 @@ def _phi(exp_z: float, z: float) -> tuple[float, float, float]:
 
 
 class Coefficients(NamedTuple):
-    """What the equations need of a model for one length of hold, precomputed (see `prepare`)."""
+    """What the equations need of a model for one length of hold, precomputed by `prepare`: `steps` steps of `h` s."""
 
+    steps: int
     h: float
     winding: Lag
     rotor: Lag
@@ -181,16 +188,17 @@ def rotor(w0: float, i0: float, im: float, i1: float, wm: float, w1: float, fric
 def winding_rotor(i0: float, w0: float, v: float, heat: float, c: Coefficients, e: Values | None,
                   x: Extra | None) -> tuple[float, float, float, float]:
     """Winding and rotor together over one hold: (i(h/2), i(h), ω(h/2), ω(h)), by two sweeps over the pair."""
-    friction = 0.0
+    friction, sticks = 0.0, False
     if e is not None and e.rotor_friction_torque > 0.0:
         friction = e.rotor_friction_torque / x.J_m
         drive = c.torque * i0
-        if w0 < 0.0 or (w0 == 0.0 and drive < -friction):
+        sticks = w0 == 0.0 and abs(drive) <= friction
+        if w0 < 0.0 or (w0 == 0.0 and drive < 0.0):
             friction = -friction
-        elif w0 == 0.0 and drive <= friction:
-            friction = drive  # it sticks
     slope = c.h * (c.torque * i0 - c.load * w0 * abs(w0) - c.drag * w0 - friction)
     wm, w1 = w0 + 0.5 * slope, w0 + slope
+    if sticks:
+        wm, w1 = 0.0, 0.0
     im, i1 = i0, i0
     k, drop, pieces = c.winding, 0.0, 1
     if e is not None and (e.brush_drop_v_brush > 0.0 or e.winding_heating_gain > 0.0):
@@ -200,13 +208,25 @@ def winding_rotor(i0: float, w0: float, v: float, heat: float, c: Coefficients, 
             im, i1 = brush_winding(i0, v, w0, wm, w1, heat, pieces, c, e, x)
         else:
             im, i1 = winding(i0, v - drop, w0, wm, w1, k, c)
-        wm, w1 = rotor(w0, i0, im, i1, wm, w1, friction, c)
-    if e is not None and e.rotor_friction_torque > 0.0:
-        if w0 == 0.0 and abs(c.torque * i0) * x.J_m <= e.rotor_friction_torque:
-            wm, w1 = 0.0, 0.0
-        elif w0 * w1 < 0.0:
-            wm, w1 = wm if w0 * wm > 0.0 else 0.0, 0.0  # it stops; whether it turns again the next hold decides
+        if sticks:
+            wm, w1 = breakaway(c.torque * i0, c.torque * im, c.torque * i1, abs(friction), 0.5 * c.h)
+        else:
+            wm, w1 = rotor(w0, i0, im, i1, wm, w1, friction, c)
+    if e is not None and not sticks and friction * w1 < 0.0:
+        wm, w1 = wm if w0 * wm > 0.0 else 0.0, 0.0  # it stops; whether it turns again the next step decides
     return im, i1, wm, w1
+
+
+@equation
+def breakaway(d0: float, dm: float, d1: float, limit: float, s: float) -> tuple[float, float]:
+    """Speed after s and 2s of a rotor that sticks until |drive| > limit, for the drive at 0, s, 2s, linear between."""
+    a, b = abs(dm) - limit, abs(d1) - limit
+    if a > 0.0:
+        wm = 0.5 * s * a * a / (abs(dm) - abs(d0))
+        return math.copysign(wm, dm), math.copysign(max(wm + 0.5 * s * (a + b), 0.0), dm)
+    if b > 0.0:
+        return 0.0, math.copysign(0.5 * s * b * b / (abs(d1) - abs(dm)), d1)
+    return 0.0, 0.0
 
 
 @equation
@@ -221,7 +241,7 @@ def linearised_winding(i0: float, v: float, heat: float, c: Coefficients, e: Val
     """The winding with brushes and heat, v - v_brush tanh(i/0.02) - R(T) i - K_e ω, made linear around i0.
 
     Args:
-        i0: current; v: voltage less back-EMF; heat: T; c, e, x: coefficients.
+        i0: current; v: voltage less back-EMF; heat: T in the middle; c, e, x: coefficients.
 
     Returns:
         Its weights, the constant part of the brush drop, and into how many pieces the hold must be cut because the
@@ -269,8 +289,8 @@ def static_thrust(w: float, c: Coefficients, e: Values | None) -> float:
 
 
 @equation
-def arm_drive(sin_theta: float, theta: float, theta_dot: float, f: float, w: float, flex: float, flex_dot: float, gust: float,
-              c: Coefficients, e: Values | None) -> float:
+def arm_drive(sin_theta: float, theta: float, theta_dot: float, f: float, w: float, flex: float, flex_dot: float,
+              gust: float, c: Coefficients, e: Values | None) -> float:
     """Torque on the arm over its inertia, less dry friction: -(mgd/J) sin θ - (c/J) θ̇ + (L/J) f, thesis (3.2)."""
     if e is None:
         return (c.lever * f - c.damping * theta_dot) - c.gravity * sin_theta
@@ -348,17 +368,32 @@ def arm_stage(sin_y: float, y: float, yd: float, q: float, qd: float, f: float, 
 
 
 @equation
+def mast_alone(q: float, qd: float, c: Coefficients, e: Values) -> tuple[float, float]:
+    """The mast's mode over one hold while the arm sticks: q, q̇ at h, as in `arm`."""
+    s = 0.5 * c.h
+    b1 = -flex_restoring(q, qd, e)
+    qm = q + s * (qd + 0.5 * s * b1)
+    b2 = -flex_restoring(qm, qd + s * b1, e)
+    b3 = -flex_restoring(qm, qd + s * b2, e)
+    b4 = -flex_restoring(q + c.h * (qd + s * b3), qd + c.h * b3, e)
+    return q + c.h * (qd + s * (1.0 / 3.0) * (b1 + b2 + b3)), qd + s * (1.0 / 3.0) * (b1 + 2.0 * (b2 + b3) + b4)
+
+
+@equation
 def arm_with_dry_friction(y: float, yd: float, q: float, qd: float, f0: float, fm: float, f1: float, w0: float,
                           wm: float, w1: float, gust: float, c: Coefficients, e: Values,
                           x: Extra) -> tuple[float, float, float, float]:
-    """As `arm`, with Coulomb friction: where the motion reverses, the hold is cut at that instant, and the arm sticks
-    there unless it is driven harder than friction holds."""
+    """As `arm`, with Coulomb friction.
+
+    Where the motion reverses, the hold is cut at that instant, and the arm sticks there unless it is driven harder than
+    friction holds.
+    """
     limit = e.coulomb_friction_accel
     direction = 1.0 if yd > 0.0 else -1.0
     if yd == 0.0:
         drive = arm_drive(math.sin(y), y, 0.0, near_ground(f0, y, e), w0, q, qd, gust, c, e)
         if abs(drive) <= limit:  # it sticks; the mast swings on alone
-            _, _, q, qd = arm(y, 0.0, q, qd, f0, f0, f0, w0, w0, w0, drive, gust, c, e, x)
+            q, qd = mast_alone(q, qd, c, e)
             return y, 0.0, q, qd
         direction = 1.0 if drive > 0.0 else -1.0
     y1, yd1, q1, qd1 = arm(y, yd, q, qd, f0, fm, f1, w0, wm, w1, direction * limit, gust, c, e, x)
@@ -378,9 +413,12 @@ def arm_with_dry_friction(y: float, yd: float, q: float, qd: float, f0: float, f
 @equation
 def advance_motor(state: State, v: float, c: Coefficients, e: Values | None, x: Extra | None
                   ) -> tuple[float, float, float, float, float]:
-    """Winding and rotor over one hold of v: current, speed at h/2 and h, angle turned, heat."""
+    """Winding and rotor over one step of v: current, speed at h/2 and h, angle turned, heat."""
     i0, w0 = state.i_a, state.omega
-    im, i1, wm, w1 = winding_rotor(i0, w0, v, state.heat, c, e, x)
+    heat = state.heat
+    if e is not None and e.winding_heating_gain > 0.0:
+        heat += 0.5 * c.h * (i0 * i0 - heat / e.winding_heating_tau)
+    im, i1, wm, w1 = winding_rotor(i0, w0, v, heat, c, e, x)
     angle = state.rotor_angle + c.h * (1.0 / 6.0) * (w0 + 4.0 * wm + w1)
     heat = 0.0
     if e is not None and e.winding_heating_gain > 0.0:
@@ -390,17 +428,17 @@ def advance_motor(state: State, v: float, c: Coefficients, e: Values | None, x: 
 
 
 @equation
-def advance_arm(state: State, wm: float, w1: float, noise: float, c: Coefficients, e: Values | None, x: Extra | None
-                ) -> tuple[float, float, float, float, float, float]:
-    """Air and arm over one hold, for the speed at 0 (in the state), h/2 and h: θ, θ̇, thrust, q, q̇, gust."""
+def advance_arm(state: State, wm: float, w1: float, c: Coefficients, e: Values | None, x: Extra | None
+                ) -> tuple[float, float, float, float, float]:
+    """Air and arm over one step, for the speed at 0 (in the state), h/2 and h: θ, θ̇, thrust, q, q̇."""
     w0, y, yd = state.omega, state.theta, state.theta_dot
     fm, f1 = static_thrust(wm, c, e), static_thrust(w1, c, e)
+    f0 = static_thrust(w0, c, e)
     if e is None:
-        f0 = static_thrust(w0, c, e)
         y, yd, _, _ = arm(y, yd, 0.0, 0.0, f0, fm, f1, w0, wm, w1, 0.0, 0.0, c, e, x)
-        return y, yd, f1, 0.0, 0.0, 0.0
-    f0 = state.thrust
+        return y, yd, f1, 0.0, 0.0
     if e.thrust_lag_tau > 0.0:
+        f0 = state.thrust
         k = x.air
         a = 1.0 / e.thrust_lag_tau
         s0, sm, s1 = a * static_thrust(w0, c, e), a * fm, a * f1
@@ -411,23 +449,22 @@ def advance_arm(state: State, wm: float, w1: float, noise: float, c: Coefficient
         y, yd, q, qd = arm_with_dry_friction(y, yd, q, qd, f0, fm, f1, w0, wm, w1, state.gust, c, e, x)
     else:
         y, yd, q, qd = arm(y, yd, q, qd, f0, fm, f1, w0, wm, w1, 0.0, state.gust, c, e, x)
-    return y, yd, f1, q, qd, x.gust_decay * state.gust + x.gust_kick * noise
+    return y, yd, f1, q, qd
 
 
 @equation
-def advance(state: State, v: float, noise: float, c: Coefficients, e: Values | None, x: Extra | None) -> State:
-    """The whole plant over one hold.
+def advance(state: State, v: float, c: Coefficients, e: Values | None, x: Extra | None) -> State:
+    """The whole plant over one step, the gust held.
 
     Args:
         state: at the start.
         v: voltage at the bridge, held (`actuator.acting_voltage`).
-        noise: standard normal number that drives `gust`.
         c: coefficients.
         e: effects, and x, their coefficients; None twice for the nominal plant.
     """
     i1, wm, w1, angle, heat = advance_motor(state, v, c, e, x)
-    y, yd, f1, q, qd, gust = advance_arm(state, wm, w1, noise, c, e, x)
-    return State(i1, w1, angle, y, yd, f1, heat, q, qd, gust)
+    y, yd, f1, q, qd = advance_arm(state, wm, w1, c, e, x)
+    return State(i1, w1, angle, y, yd, f1, heat, q, qd, state.gust)
 
 
 def steady(model: Model, duty: float) -> State:
@@ -439,24 +476,46 @@ def steady(model: Model, duty: float) -> State:
                  float(actuator.thrust(n, omega)))
 
 
-def prepare(model: Model, period: float = SAMPLE_PERIOD) -> tuple[Coefficients, Values | None, Extra | None]:
-    """What `advance` needs of a model for holds of `period` seconds."""
+def steps_in(model: Model, period: float) -> int:
+    """Into how many steps a hold of `period` s must be cut: 1 at the rig's period unless the plant is much faster."""
+    n, e = model.numbers(), values(model.effects)
+    top_speed = (abs(n["k0"]) + n["k1"] * math.sqrt(n["k2"] + n["k3"])) / n["K_e"]  # rad/s, never reached
+    back = n["K_t"] * n["K_e"] / (n["J_m"] * n["L_a"])  # 1/s²: the speed acts back on itself through the winding
+    rates = [1.0 / LONGEST_STEP,
+             min(math.sqrt(back / 0.04), back * n["L_a"] / (0.02 * n["R_a"])),
+             2.0 * n["k_load"] * top_speed / n["J_m"] / 0.1,
+             math.sqrt(n["mgd_over_J"]) / 0.3, n["c_over_J"] / 0.3]
+    if e is not None:
+        free = 1.0 - e.mast_flex_coupling
+        damping = n["c_over_J"] + n["L_over_J"] * e.axial_inflow_k * top_speed
+        rates += [math.sqrt((n["mgd_over_J"] + abs(e.cable_torque_k)) / free) / 0.3, damping / free / 0.3]
+        if e.mast_flex_coupling > 0.0:
+            rates += [e.mast_flex_omega / math.sqrt(free) / 0.3,
+                      2.0 * e.mast_flex_zeta * e.mast_flex_omega / free / 0.3]
+    return min(MOST_STEPS, math.ceil(period * max(rates) - 1e-9))
+
+
+def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0
+            ) -> tuple[Coefficients, Values | None, Extra | None]:
+    """What `run` needs of a model for holds of `period` seconds, cut into `steps` (0: as many as it takes)."""
     n = model.numbers()
     e = values(model.effects)
+    steps = steps or steps_in(model, period)
+    h = period / steps
     resistance = n["R_a"] + (e.supply_sag_r_supply if e else 0.0)
-    c = Coefficients(period, lag(resistance / n["L_a"], period), lag(n["B_m"] / n["J_m"], period), 1.0 / n["L_a"],
+    c = Coefficients(steps, h, lag(resistance / n["L_a"], h), lag(n["B_m"] / n["J_m"], h), 1.0 / n["L_a"],
                      n["K_e"], n["K_t"] / n["J_m"], n["k_load"] / n["J_m"], n["B_m"] / n["J_m"], n["k_thrust"],
                      n["mgd_over_J"], n["c_over_J"], n["L_over_J"])
     if e is None:
         return c, None, None
-    air = lag(1.0 / e.thrust_lag_tau if e.thrust_lag_tau > 0.0 else 0.0, period)
+    air = lag(1.0 / e.thrust_lag_tau if e.thrust_lag_tau > 0.0 else 0.0, h)
     gust_decay = math.exp(-period / e.gust_tau)
-    return c, e, Extra(lag(1.0 / e.winding_heating_tau, period), air, n["R_a"], resistance, n["J_m"],
+    return c, e, Extra(lag(1.0 / e.winding_heating_tau, h), air, n["R_a"], resistance, n["J_m"],
                        gust_decay, e.gust_sigma * math.sqrt(1.0 - gust_decay**2), 1.0 / (1.0 - e.mast_flex_coupling))
 
 
 class Trajectory(NamedTuple):
-    """States at the samples, each (N,), SI: `v_a` is the voltage at the motor's terminals during the hold that begins."""
+    """States at the samples, each (N,), SI; `v_a` is the voltage at the motor's terminals as the hold begins."""
 
     theta: Array
     theta_dot: Array
@@ -467,41 +526,48 @@ class Trajectory(NamedTuple):
     thrust: Array
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def run(v: Array, noise: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
-    """Record the state at the start of each hold in out (7, N), then advance over it; returns the state after the last."""
+    """Record the state at the start of each hold in out (7, N), advance over it; return the state after the last."""
     for k in range(v.shape[0]):
         out[0, k], out[1, k], out[2, k], out[3, k] = state.theta, state.theta_dot, state.i_a, state.omega
         out[5, k], out[6, k] = state.rotor_angle, state.thrust
         if e is None:
             out[4, k] = v[k]
-            state = advance(state, v[k], 0.0, c, e, x)
         else:
             out[4, k] = v[k] - e.supply_sag_r_supply * state.i_a
-            state = advance(state, v[k], noise[k], c, e, x)
+        for _ in range(c.steps):
+            state = advance(state, v[k], c, e, x)
+        if e is not None:
+            s = state
+            state = State(s.i_a, s.omega, s.rotor_angle, s.theta, s.theta_dot, s.thrust, s.heat, s.flex, s.flex_dot,
+                          x.gust_decay * s.gust + x.gust_kick * noise[k])
     return state
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def run_arm(speed: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
     """Air and arm alone, for a given speed (N,), linear between samples; fills out (2, N) with θ, θ̇."""
     for k in range(speed.shape[0]):
         out[0, k], out[1, k] = state.theta, state.theta_dot
-        w0 = speed[k]
-        w1 = speed[min(k + 1, speed.shape[0] - 1)]
-        now = State(0.0, w0, 0.0, state.theta, state.theta_dot, state.thrust, 0.0, state.flex, state.flex_dot, 0.0)
-        y, yd, f1, q, qd, _ = advance_arm(now, 0.5 * (w0 + w1), w1, 0.0, c, e, x)
-        state = State(0.0, w1, 0.0, y, yd, f1, 0.0, q, qd, 0.0)
+        w = speed[k]
+        rise = (speed[min(k + 1, speed.shape[0] - 1)] - w) / c.steps
+        for _ in range(c.steps):
+            now = State(0.0, w, 0.0, state.theta, state.theta_dot, state.thrust, 0.0, state.flex, state.flex_dot, 0.0)
+            y, yd, f1, q, qd = advance_arm(now, w + 0.5 * rise, w + rise, c, e, x)
+            w += rise
+            state = State(0.0, w, 0.0, y, yd, f1, 0.0, q, qd, 0.0)
     return state
 
 
-@njit(cache=True, fastmath={"contract"})
+@njit(cache=True, nogil=True, fastmath={"contract"})
 def run_motor(v: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
     """Winding and rotor alone, for the voltage at the terminals (N,), held; fills out (3, N) with i_a, ω, angle."""
     for k in range(v.shape[0]):
         out[0, k], out[1, k], out[2, k] = state.i_a, state.omega, state.rotor_angle
-        i1, _, w1, angle, heat = advance_motor(state, v[k], c, e, x)
-        state = State(i1, w1, angle, 0.0, 0.0, 0.0, heat, 0.0, 0.0, 0.0)
+        for _ in range(c.steps):
+            i1, _, w1, angle, heat = advance_motor(state, v[k], c, e, x)
+            state = State(i1, w1, angle, 0.0, 0.0, 0.0, heat, 0.0, 0.0, 0.0)
     return state
 
 
@@ -538,7 +604,7 @@ _MAP, _STATE, _ERRORS, _VOLTAGE, _ROWS = 26, 30, 36, 40, 41
 def _lane(a: Array, j: int) -> Coefficients:
     n = LANES
     return Coefficients(
-        a[j], Lag(a[n + j], a[2 * n + j], a[3 * n + j], a[4 * n + j], a[5 * n + j], a[6 * n + j], a[7 * n + j],
+        1, a[j], Lag(a[n + j], a[2 * n + j], a[3 * n + j], a[4 * n + j], a[5 * n + j], a[6 * n + j], a[7 * n + j],
                   a[8 * n + j]),
         Lag(a[9 * n + j], a[10 * n + j], a[11 * n + j], a[12 * n + j], a[13 * n + j], a[14 * n + j], a[15 * n + j],
             a[16 * n + j]),
@@ -546,8 +612,26 @@ def _lane(a: Array, j: int) -> Coefficients:
         a[24 * n + j], a[25 * n + j])
 
 
+@equation
+def _lane_state(a: Array, j: int) -> State:
+    n = LANES
+    return State(a[_STATE * n + j], a[(_STATE + 1) * n + j], 0.0, a[(_STATE + 3) * n + j], a[(_STATE + 4) * n + j],
+                 a[(_STATE + 5) * n + j], 0.0, 0.0, 0.0, 0.0)
+
+
+@equation
+def _advance_lane(a: Array, j: int, x: State, v: float) -> None:
+    n = LANES
+    y = advance(x, v, _lane(a, j), None, None)
+    a[_STATE * n + j] = y.i_a
+    a[(_STATE + 1) * n + j] = y.omega
+    a[(_STATE + 3) * n + j] = y.theta
+    a[(_STATE + 4) * n + j] = y.theta_dot
+    a[(_STATE + 5) * n + j] = y.thrust
+
+
 @njit(cache=True, parallel=True, fastmath={"contract"})
-def _squared_errors(duty: Array, measured: Array, table: Array) -> None:
+def _squared_errors(duty: Array, measured: Array, steps: int, table: Array) -> None:
     """One row of `table` is a block of models: row r of model j is at r LANES + j, so that lanes are SIMD lanes."""
     n = LANES
     for block in prange(table.shape[0]):
@@ -560,18 +644,15 @@ def _squared_errors(duty: Array, measured: Array, table: Array) -> None:
             m0, m1, m2, m3 = measured[0, k], measured[1, k], measured[2, k], measured[3, k]
             for j in range(n):
                 v = a[_VOLTAGE * n + j]
-                x = State(a[_STATE * n + j], a[(_STATE + 1) * n + j], 0.0, a[(_STATE + 3) * n + j],
-                          a[(_STATE + 4) * n + j], a[(_STATE + 5) * n + j], 0.0, 0.0, 0.0, 0.0)
+                x = _lane_state(a, j)
                 a[_ERRORS * n + j] += (x.theta - m0) * (x.theta - m0)
                 a[(_ERRORS + 1) * n + j] += (x.omega - m1) * (x.omega - m1)
                 a[(_ERRORS + 2) * n + j] += (x.i_a - m2) * (x.i_a - m2)
                 a[(_ERRORS + 3) * n + j] += (v - m3) * (v - m3)
-                y = advance(x, v, 0.0, _lane(a, j), None, None)
-                a[_STATE * n + j] = y.i_a
-                a[(_STATE + 1) * n + j] = y.omega
-                a[(_STATE + 3) * n + j] = y.theta
-                a[(_STATE + 4) * n + j] = y.theta_dot
-                a[(_STATE + 5) * n + j] = y.thrust
+                _advance_lane(a, j, x, v)
+            for _ in range(steps - 1):
+                for j in range(n):
+                    _advance_lane(a, j, _lane_state(a, j), a[_VOLTAGE * n + j])
 
 
 def squared_errors(models: Sequence[Model], duty: Array, measured: Array, period: float = SAMPLE_PERIOD,
@@ -591,17 +672,18 @@ def squared_errors(models: Sequence[Model], duty: Array, measured: Array, period
     Raises:
         ValueError: a model has effects.
     """
-    if any(values(model.effects) is not None for model in models):
+    if any(id_ != PARAMETER_MISMATCH and is_active(id_, p) for model in models for id_, p in model.effects.items()):
         raise ValueError("squared_errors simulates nominal models only; use simulate for effects")
     blocks = -(-len(models) // LANES)
+    steps = max((steps_in(model, period) for model in models), default=1)
     rows = np.zeros((blocks * LANES, _ROWS))
     for j in range(len(rows)):
         m = min(j, len(models) - 1)  # the last block is filled up with the last model
         numbers = models[m].numbers()
-        c = prepare(models[m], period)[0]
-        rows[j, :_STATE] = [c.h, *c.winding, *c.rotor, *c[3:], *(numbers[key] for key in ("k0", "k1", "k2", "k3"))]
+        c = prepare(models[m], period, steps)[0]
+        rows[j, :_STATE] = [c.h, *c.winding, *c.rotor, *c[4:], *(numbers[key] for key in ("k0", "k1", "k2", "k3"))]
         rows[j, _STATE:_ERRORS] = (states[m] if states is not None else State())[:6]
-    table = np.ascontiguousarray(rows.reshape(blocks, LANES, _ROWS).transpose(0, 2, 1)).reshape(blocks, -1)
-    _squared_errors(np.ascontiguousarray(duty, dtype=float), np.ascontiguousarray(measured, dtype=float), table)
+    table = np.ascontiguousarray(rows.reshape(blocks, LANES, _ROWS).transpose(0, 2, 1)).reshape(blocks, _ROWS * LANES)
+    _squared_errors(np.ascontiguousarray(duty, dtype=float), np.ascontiguousarray(measured, dtype=float), steps, table)
     errors = table.reshape(blocks, _ROWS, LANES)[:, _ERRORS:_VOLTAGE]
     return errors.transpose(0, 2, 1).reshape(-1, 4)[:len(models)]

@@ -7,6 +7,7 @@ To add one: an entry here, its term in `actuator.py`, `dynamics.py` or `sensing.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -40,6 +41,8 @@ class Effect:
     place: str
     physics: str
     parameters: dict[str, EffectParameter]
+    in_equations: bool = True
+    """Whether `dynamics` holds its term, or only `actuator` or `sensing`, which shape the input and the reading."""
 
     @property
     def size(self) -> str:
@@ -51,13 +54,13 @@ P = EffectParameter
 
 _ENTRIES = (
     Effect("bridge_drop", "actuator", "the H-bridge takes a constant voltage: v = max(0, map(τ) - v_drop)",
-           {"v_drop": P("V", 0.0, 0.2, 0.0, 2.0, "voltage lost in the bridge")}),
+           {"v_drop": P("V", 0.0, 0.2, 0.0, 2.0, "voltage lost in the bridge")}, in_equations=False),
     Effect("supply_sag", "actuator", "the supply yields under load: v = map(τ) - r_supply i",
            {"r_supply": P("Ω", 0.0, 0.15, 0.0, 5.0, "internal resistance of the supply")}),
     Effect("supply_drift", "actuator", "the battery empties: v = map(τ)(1 - rate t)",
-           {"rate": P("1/s", 0.0, 2e-3, -0.02, 0.02, "relative loss of voltage per second")}),
+           {"rate": P("1/s", 0.0, 2e-3, -0.02, 0.02, "relative loss of voltage per second")}, in_equations=False),
     Effect("command_delay", "actuator", "the duty applied acts later",
-           {"delay": P("s", 0.0, 0.03, 0.0, 0.5, "time from the duty to its effect")}),
+           {"delay": P("s", 0.0, 0.03, 0.0, 0.5, "time from the duty to its effect")}, in_equations=False),
     Effect("brush_drop", "electrical", "the brushes take v_brush tanh(i/0.02) of the armature voltage",
            {"v_brush": P("V", 0.0, 0.12, 0.0, 1.0, "voltage over the brushes")}),
     Effect("winding_heating", "electrical", "the winding warms: R = R_a (1 + gain T), Ṫ = i² - T/tau",
@@ -89,20 +92,20 @@ _ENTRIES = (
            {"sigma": P("rad/s²", 0.0, 1.5, 0.0, 50.0, "standard deviation"),
             "tau": P("s", 0.3, 0.3, 0.005, 30.0, "correlation time")}),
     Effect("angle_offset", "sensing", "θ + bias is read (an offset centre of mass looks the same)",
-           {"bias": P("rad", 0.0, 0.06, -1.0, 1.0, "angle read at rest")}),
+           {"bias": P("rad", 0.0, 0.06, -1.0, 1.0, "angle read at rest")}, in_equations=False),
     Effect("encoder_lag", "sensing", "the angle filter is slower than the model file says",
-           {"tau": P("s", 0.0, 0.03, 0.0, 0.5, "what is added to each stage of the filter")}),
+           {"tau": P("s", 0.0, 0.03, 0.0, 0.5, "what is added to each stage of the filter")}, in_equations=False),
     Effect("encoder_eccentricity", "sensing", "the magnet sits off the axis: θ + amplitude sin(θ + phase) is read",
            {"amplitude": P("rad", 0.0, 0.06, 0.0, 0.5, "amplitude of the error"),
-            "phase": P("rad", 0.5, 0.5, -math.pi, math.pi, "direction of the offset")}),
+            "phase": P("rad", 0.5, 0.5, -math.pi, math.pi, "direction of the offset")}, in_equations=False),
     Effect("current_gain", "sensing", "i (1 + gain) is read",
-           {"gain": P("-", 0.0, 0.15, -0.9, 3.0, "relative error of the reading")}),
+           {"gain": P("-", 0.0, 0.15, -0.9, 3.0, "relative error of the reading")}, in_equations=False),
     Effect("current_offset", "sensing", "i + bias is read",
-           {"bias": P("A", 0.0, 0.06, -2.0, 2.0, "current read at zero")}),
+           {"bias": P("A", 0.0, 0.06, -2.0, 2.0, "current read at zero")}, in_equations=False),
     Effect("voltage_offset", "sensing", "v + bias is read",
-           {"bias": P("V", 0.0, 0.1, -3.0, 3.0, "voltage read at zero")}),
+           {"bias": P("V", 0.0, 0.1, -3.0, 3.0, "voltage read at zero")}, in_equations=False),
     Effect("speed_spikes", "sensing", "false capture periods: outliers in ω",
-           {"rate": P("1/s", 0.0, 2.0, 0.0, 100.0, "mean number of false periods per second")}),
+           {"rate": P("1/s", 0.0, 2.0, 0.0, 100.0, "mean number of false periods per second")}, in_equations=False),
 )
 
 CATALOGUE: dict[str, Effect] = {entry.id: entry for entry in _ENTRIES}
@@ -112,25 +115,26 @@ SPIKE_FACTOR = (1.3, 4.0)
 """A false capture period is too short: the speed read is this many times the true one, uniform between the two."""
 
 _FIELDS = {f"{effect.id}_{name}": parameter.neutral
-           for effect in _ENTRIES for name, parameter in effect.parameters.items()}
+           for effect in _ENTRIES if effect.in_equations for name, parameter in effect.parameters.items()}
 
 Values = NamedTuple("Values", [(name, float) for name in _FIELDS])  # type: ignore[misc]
-"""Every parameter of every effect as `<id>_<parameter>`: what the compiled equations read."""
+"""Every parameter of every effect in the equations as `<id>_<parameter>`: what `dynamics` reads."""
 
 
-def is_active(effect_id: str, parameters: dict[str, float]) -> bool:
+def is_active(effect_id: str, parameters: Mapping[str, float]) -> bool:
     """Whether an effect with these parameters differs from the nominal model."""
     effect = CATALOGUE[effect_id]
     return parameters[effect.size] != effect.parameters[effect.size].neutral
 
 
-def values(effects: dict[str, dict[str, float]]) -> Values | None:
-    """Flatten active effects for the compiled equations; None when none is active.
+def values(effects: Mapping[str, Mapping[str, float]]) -> Values | None:
+    """Flatten the active effects that the equations hold; None when there is none.
 
     Args:
         effects: effect id -> parameter name -> value, complete (see `parameters.from_flat`).
     """
-    active = {id_: p for id_, p in effects.items() if id_ in CATALOGUE and is_active(id_, p)}
+    active = {id_: p for id_, p in effects.items()
+              if id_ in CATALOGUE and CATALOGUE[id_].in_equations and is_active(id_, p)}
     if not active:
         return None
     flat = {f"{id_}_{name}": float(value) for id_, p in active.items() for name, value in p.items()}
