@@ -27,8 +27,8 @@ from aeropend_sim.parameters import SAMPLE_PERIOD, Model
 
 Array = NDArray[np.float64]
 
-equation = njit(cache=True, forceinline=True, fastmath={"contract"})
-"""Compiles one equation into whatever calls it; products and sums may be fused, which changes the last bit at most."""
+equation = njit(cache=True, forceinline=True)
+"""Compiles one equation into whatever calls it."""
 
 THRUST_PIVOT_SPEED = 150.0
 """rad/s at which `thrust_exponent` leaves the thrust as it is (contract section 4)."""
@@ -526,7 +526,7 @@ class Trajectory(NamedTuple):
     thrust: Array
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True)
 def run(v: Array, noise: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
     """Record the state at the start of each hold in out (7, N), advance over it; return the state after the last."""
     for k in range(v.shape[0]):
@@ -545,7 +545,7 @@ def run(v: Array, noise: Array, state: State, c: Coefficients, e: Values | None,
     return state
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True)
 def run_arm(speed: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
     """Air and arm alone, for a given speed (N,), linear between samples; fills out (2, N) with θ, θ̇."""
     for k in range(speed.shape[0]):
@@ -560,7 +560,7 @@ def run_arm(speed: Array, state: State, c: Coefficients, e: Values | None, x: Ex
     return state
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True)
 def run_motor(v: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
     """Winding and rotor alone, for the voltage at the terminals (N,), held; fills out (3, N) with i_a, ω, angle."""
     for k in range(v.shape[0]):
@@ -630,7 +630,7 @@ def _advance_lane(a: Array, j: int, x: State, v: float) -> None:
     a[(_STATE + 5) * n + j] = y.thrust
 
 
-@njit(cache=True, parallel=True, fastmath={"contract"})
+@njit(cache=True, parallel=True)
 def _squared_errors(duty: Array, measured: Array, steps: int, table: Array) -> None:
     """One row of `table` is a block of models: row r of model j is at r LANES + j, so that lanes are SIMD lanes."""
     n = LANES

@@ -115,6 +115,19 @@ def filter_angle(m: Memory, theta: float, theta_dot: float, c: Chain) -> tuple[f
     return stage1, stage2
 
 
+@njit(cache=True, nogil=True)
+def angle_reading(theta: Array, theta_dot: Array, c: Chain) -> Array:
+    """The angle (N,) that the encoder and its filter give for a motion (N,), before noise and quantisation."""
+    out = np.empty(theta.shape[0])
+    m = start(theta[0], theta_dot[0], 0.0, 0.0, c)
+    for k in range(theta.shape[0]):
+        if k > 0:
+            stage1, stage2 = filter_angle(m, theta[k], theta_dot[k], c)
+            m = Memory(stage1, stage2, theta[k], theta_dot[k], 0.0, 0.0, 0.0, 0.0, 0.0)
+        out[k] = m.stage2
+    return out
+
+
 @njit(cache=True)
 def time_pulses(m: Memory, omega: float, rotor_angle: float, uniform: Array, normal: float, c: Chain
                 ) -> tuple[float, float, float]:
@@ -143,7 +156,7 @@ def time_pulses(m: Memory, omega: float, rotor_angle: float, uniform: Array, nor
     return last, speed, now
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def read(out: Array, truth: Array, normal: Array, uniform: Array, m: Memory, first: bool, c: Chain) -> Memory:
     """Read N states in sequence.
 
