@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
-import math
+import difflib
 import os
+import re
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -19,6 +20,9 @@ SAMPLE_PERIOD = 64 * 510 / 16e6
 """Sample period in s: Timer1 of a 16 MHz ATmega2560, 8-bit phase-correct PWM, prescaler 64 (thesis 4.3.2)."""
 
 PRESETS = ("bench", "thesis")
+
+SECTIONS = ("model", "sensing", "effects")
+"""The parts of a model file; a node's own parameters may stand beside them."""
 
 
 class ModelError(ValueError):
@@ -92,15 +96,14 @@ class Model:
 
 def _number(key: str, value: object, low: float, high: float, unit: str, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ModelError(f"{where}: {key} is {value!r}; give a number in {unit}")
-    if not (math.isfinite(value) and low <= value <= high):
-        raise ModelError(f"{where}: {key} = {value:g} {unit} is out of range; give {low:g} to {high:g}")
+        raise ModelError(f"{where}: {key} is {value!r}; give a number" + (f" in {unit}" if unit != "-" else ""))
+    if not low <= value <= high:
+        size = f"{value:g} {unit}" if unit != "-" else f"{value:g}"
+        raise ModelError(f"{where}: {key} = {size} is out of range; give {low:g} to {high:g}")
     return float(value)
 
 
 def _unknown(what: str, key: str, known: Mapping[str, object] | tuple[str, ...], where: str) -> ModelError:
-    import difflib
-
     near = difflib.get_close_matches(key, list(known), n=1)
     hint = f"did you mean {near[0]}?" if near else "known: " + ", ".join(known)
     return ModelError(f"{where}: unknown {what} '{key}'; {hint}")
@@ -125,6 +128,8 @@ def from_flat(flat: Mapping[str, object], name: str = "model", base: Model | Non
         effects = {id_: dict(parameters) for id_, parameters in base.effects.items()}
     for key, value in flat.items():
         section, _, rest = key.partition(".")
+        if key in SECTIONS:
+            raise ModelError(f"{name}: '{key}' is {value!r}; give its numbers by name, one a line")
         if section == "effects":
             _read_effect(effects, rest, value, name)
         elif key in PARAMETERS:
@@ -135,17 +140,24 @@ def from_flat(flat: Mapping[str, object], name: str = "model", base: Model | Non
     missing = [key for key in PARAMETERS if key not in numbers]
     if missing:
         raise ModelError(f"{name}: {missing[0]} is missing ({len(missing)} in all); "
-                         "a model file gives every number of contract section 'model' and 'sensing'")
+                         "a model file gives every number that the presets give")
     for id_, parameters in effects.items():
         if id_ != PARAMETER_MISMATCH:
-            for key, p in CATALOGUE[id_].parameters.items():
-                parameters.setdefault(key, p.default)
+            for key, q in CATALOGUE[id_].parameters.items():
+                parameters.setdefault(key, q.default)
     return Model(name, {n: numbers[f"model.{n}"] for n in MODEL_NAMES},
                  {n: numbers[f"sensing.{n}"] for n in SENSING_NAMES}, effects)
 
 
 def _read_effect(effects: dict[str, dict[str, float]], rest: str, value: object, where: str) -> None:
     id_, _, parameter = rest.partition(".")
+    known = (*CATALOGUE, PARAMETER_MISMATCH)
+    if id_ not in known:
+        raise _unknown("effect", id_, known, where)
+    if not parameter:
+        example = "R_a: 1.2" if id_ == PARAMETER_MISMATCH else (
+            f"{CATALOGUE[id_].size}: {CATALOGUE[id_].parameters[CATALOGUE[id_].size].default:g}")
+        raise ModelError(f"{where}: effects.{id_} has no parameter; give at least one, as in {id_}: {{{example}}}")
     if id_ == PARAMETER_MISMATCH:
         key = f"model.{parameter}"
         if key not in PARAMETERS:
@@ -153,8 +165,6 @@ def _read_effect(effects: dict[str, dict[str, float]], rest: str, value: object,
         p = PARAMETERS[key]
         effects.setdefault(id_, {})[parameter] = _number(f"effects.{rest}", value, p.low, p.high, p.unit, where)
         return
-    if id_ not in CATALOGUE:
-        raise _unknown("effect", id_, (*CATALOGUE, PARAMETER_MISMATCH), where)
     if parameter not in CATALOGUE[id_].parameters:
         raise _unknown(f"parameter of {id_}", parameter, tuple(CATALOGUE[id_].parameters), where)
     q = CATALOGUE[id_].parameters[parameter]
@@ -171,12 +181,12 @@ def to_flat(model: Model) -> dict[str, float]:
 
 
 def flatten(tree: Mapping[str, object], prefix: str = "") -> dict[str, object]:
-    """Nested mappings to dotted names; an empty mapping (as in `effects: {}`) adds nothing."""
+    """Nested mappings to dotted names; an empty section (as in `effects: {}`) adds nothing."""
     flat: dict[str, object] = {}
     for key, value in tree.items():
-        if isinstance(value, Mapping):
+        if isinstance(value, Mapping) and value:
             flat.update(flatten(value, f"{prefix}{key}."))
-        elif not (value is None and f"{prefix}{key}" == "effects"):
+        elif value or value == 0 or prefix or key not in SECTIONS:
             flat[f"{prefix}{key}"] = value
     return flat
 
@@ -201,11 +211,35 @@ def load(source: str | Path) -> Model:
             reason = getattr(error, "strerror", None) or "not a text file"
             raise ModelError(f"{source}: the model file cannot be read: {reason}") from None
     try:
-        tree = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        line = f" at line {error.problem_mark.line + 1}" if getattr(error, "problem_mark", None) else ""
-        raise ModelError(f"{name}: not valid YAML{line}; see the presets for the form") from None
+        tree = yaml.load(text, _Loader)
+    except yaml.MarkedYAMLError as error:
+        line = f" at line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise ModelError(f"{name}: not valid YAML{line}: {error.problem}; see the presets for the form") from None
+    except (yaml.YAMLError, RecursionError):
+        raise ModelError(f"{name}: not a model file; see the presets for the form") from None
     return from_flat(_node_parameters(tree, name), name)
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads numbers as rcl does (1e-5 is one, which YAML 1.1 takes for text), and no key twice."""
+
+    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 - PyYAML's own
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, object]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            name = str(key.value)
+            if name in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"{name} is given twice", key.start_mark)
+            seen.add(name)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$"),
+    list("-+.0123456789"))
+_Loader.add_implicit_resolver("tag:yaml.org,2002:null", re.compile(r"~$|null$|Null$|NULL$|$"), ["~", "n", "N", ""])
 
 
 def _node_parameters(tree: object, name: str) -> dict[str, object]:
@@ -213,7 +247,13 @@ def _node_parameters(tree: object, name: str) -> dict[str, object]:
     found = [s["ros__parameters"] for s in sections if isinstance(s, Mapping) and "ros__parameters" in s]
     if len(found) != 1 or not isinstance(found[0], Mapping):
         raise ModelError(f"{name}: not a model file; it starts with '/**:' and 'ros__parameters:' (see the presets)")
-    mine = {key: value for key, value in found[0].items() if str(key).split(".")[0] in ("model", "sensing", "effects")}
+    mine: dict[str, object] = {}
+    for key, value in found[0].items():
+        section, dot, _ = str(key).partition(".")
+        if section in SECTIONS:
+            mine[str(key)] = value
+        elif (dot or isinstance(value, Mapping)) and difflib.get_close_matches(section, SECTIONS, cutoff=0.7):
+            raise _unknown("section", section, SECTIONS, name)
     return flatten(mine)
 
 
@@ -224,6 +264,9 @@ def save(model: Model, path: str | Path, comment: str = "") -> None:
         model: what to write; its `name` is not written.
         path: the file.
         comment: lines put at the top, each behind `# `.
+
+    Raises:
+        ModelError: the file cannot be written; what was there before is untouched.
     """
     tree: dict[str, object] = {"model": dict(model.model), "sensing": dict(model.sensing)}
     if model.effects:  # rcl's parser refuses an empty mapping
@@ -231,14 +274,18 @@ def save(model: Model, path: str | Path, comment: str = "") -> None:
     head = "".join(f"# {line}\n" for line in comment.splitlines())
     text = head + yaml.dump({"/**": {"ros__parameters": tree}}, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
     path = Path(path)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name)
+    temporary = None
     try:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name)
         with os.fdopen(handle, "w", encoding="utf-8") as file:
             file.write(text)
         Path(temporary).chmod(0o644)
         Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink()
+    except BaseException as error:
+        if temporary is not None:
+            Path(temporary).unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise ModelError(f"{path}: the model file cannot be written: {error.strerror}") from None
         raise
 
 
