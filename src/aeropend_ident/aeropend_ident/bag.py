@@ -46,6 +46,7 @@ STORAGES = {".mcap": "mcap", ".db3": "sqlite3"}
 _MAGIC = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
 _LAST_OPCODE = 0x0F
+_LONGEST = 1 << 32  # a record that says it is longer says nonsense
 _head = struct.Struct("<BQ")  # opcode, length of what follows
 _message_head = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
@@ -134,7 +135,7 @@ class Bag:
             custom = dict(information.get("custom_data") or {})
         except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
             if not found:
-                raise RecordingError(f"{folder}: not a bag: its metadata.yaml is damaged, and no file is there") from error
+                raise RecordingError(f"{folder}: not a bag: metadata.yaml is damaged and alone") from error
             self._say("metadata.yaml is damaged")
             return found
         if version > NEWEST_VERSION:
@@ -193,10 +194,11 @@ def _read_mcap(
         if stream.read(8) != _MAGIC:
             raise RecordingError(f"{file}: not an MCAP file")
         records = _Records(chosen, counts)
-        closed = False
+        closed = garbled = False
         while len(head := stream.read(_head.size)) == _head.size:
             opcode, length = _head.unpack(head)
             if not 0 < opcode <= _LAST_OPCODE and opcode < 0x80:  # from 0x80 on they are private: skipped
+                garbled = True
                 break
             if opcode == _DATA_END:
                 closed = True
@@ -209,6 +211,7 @@ def _read_mcap(
                     say(f"{file.name}: a chunk before byte {stream.tell()} is damaged: {chunk.damage}")
                 yield from records.read(chunk.data)
             elif length > left:
+                garbled = length > _LONGEST
                 break
             elif opcode in (_SCHEMA, _CHANNEL, _MESSAGE):
                 yield from records.read(head + stream.read(length))
@@ -216,14 +219,17 @@ def _read_mcap(
                 stream.seek(length, 1)
         if records.strays:
             say(f"{file.name}: {records.strays} messages belong to no known topic")
-        end = stream.tell()
+        if garbled:
+            place = stream.tell() - _head.size
+            say(f"{file.name} cannot be read past byte {place} of {size}: what comes after is lost")
+            return
         stream.seek(-8, 2)
-        if not closed and end + len(_MAGIC) < size:
-            say(f"{file.name} cannot be read past byte {end} of {size}: what comes after is lost")
-        elif not closed:
-            say(f"{file.name} ends without its index: the recording was broken off, its last moments are lost")
-        elif stream.read(8) != _MAGIC:
+        if closed and stream.read(8) == _MAGIC:
+            return
+        if closed:
             say(f"{file.name} ends inside its index: the recording was broken off, no message is lost")
+        else:
+            say(f"{file.name} ends without its index: the recording was broken off, its last moments are lost")
 
 
 class _Chunk:
@@ -414,9 +420,18 @@ def _settle(file: Path) -> None:
 
 def _salvage(file: Path, chosen: Chosen | None, counts: Counter[tuple[str, str]], last: int) -> Messages:
     """Yield the rows of a damaged SQLite bag file that can still be read, of those received after `last` (ns)."""
-    database = sqlite3.connect(f"file:{file}?immutable=1", uri=True)
+    folder = Path(tempfile.mkdtemp(prefix="aeropend-"))
+    copy = folder / file.name
+    shutil.copyfile(file, copy)
+    with copy.open("r+b") as stream:  # a page that is there in part would be read as if the rest of it were zeros
+        size = int.from_bytes(stream.read(18)[16:], "big")
+        page = {0: 1, 1: 65536}.get(size, size)
+        stream.truncate(copy.stat().st_size // page * page)
+    database = sqlite3.connect(copy)
     database.row_factory = sqlite3.Row
     try:
+        # without this, SQLite refuses a file that is shorter than its header says
+        database.execute("PRAGMA writable_schema=ON")
         connections = {row["id"]: _connection(row) for row in _rows(database, "SELECT * FROM topics")}
         start, misses = 1, 0
         while misses < 64:
@@ -432,6 +447,7 @@ def _salvage(file: Path, chosen: Chosen | None, counts: Counter[tuple[str, str]]
                     yield connection, row["timestamp"], row["data"]
     finally:
         database.close()
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _rows(database: sqlite3.Connection, query: str, *arguments: Any) -> Iterator[sqlite3.Row]:

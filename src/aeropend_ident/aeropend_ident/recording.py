@@ -244,9 +244,9 @@ class _Join:
                 notes.append("no stamp of armature equals one of joint_states: armature is left out")
                 armature = empty
             elif alone := len(joints.stamps) - common:
-                notes.append(f"{alone} samples of joint_states have no armature of the same stamp")
+                notes.append(f"{_many(alone, 'sample')} of joint_states {_has(alone)} no armature of the same stamp")
             if common and (alone := len(armature.stamps) - common):
-                notes.append(f"{alone} samples of armature have no joint_states of the same stamp")
+                notes.append(f"{_many(alone, 'sample')} of armature {_has(alone)} no joint_states of the same stamp")
         self.stamps = np.union1d(joints.stamps, armature.stamps)
         if not len(self.stamps):
             raise RecordingError(f"no sample could be read: {'; '.join(notes)}")
@@ -266,12 +266,15 @@ class _Join:
     def recording(self, path: str, namespace: str, *, complete: bool) -> Recording:
         """Say what there is to say, and hand over the arrays."""
         channels = tuple(name for name in CHANNELS if np.isfinite(self.columns[name]).any())
-        if missing := [name for name in CHANNELS if name not in channels]:
-            self.notes.append(f"not measured: {', '.join(missing)}")
+        if unmeasured := [name for name in CHANNELS if name not in channels]:
+            self.notes.append(f"not measured: {', '.join(unmeasured)}")
         if self.duplicates:
-            self.notes.append(f"{self.duplicates} messages repeat a stamp: the first of each counts")
+            repeat = "repeats" if self.duplicates == 1 else "repeat"
+            self.notes.append(f"{_many(self.duplicates, 'message')} {repeat} a stamp: the first of each counts")
         if len(self.gaps):
-            self.notes.append(f"{int(self.gaps[:, 1].sum())} samples are missing in {len(self.gaps)} gaps")
+            missing = int(self.gaps[:, 1].sum())
+            are = "is" if missing == 1 else "are"
+            self.notes.append(f"{_many(missing, 'sample')} {are} missing in {_many(len(self.gaps), 'gap')}")
         return Recording(
             path=path,
             namespace=namespace,
@@ -329,7 +332,7 @@ class _Join:
     def _decode(self, series: _Series) -> list[Block]:
         blocks, failed = decode(series.messages, series.msgtype)
         if failed:
-            self.notes.append(f"{len(failed)} messages of {series.topic} could not be decoded")
+            self.notes.append(f"{_many(len(failed), 'message')} of {series.topic} could not be decoded")
         return blocks
 
     def _table(self, series: _Series, blocks: list[Block], columns: dict[str, Floats]) -> _Table:
@@ -387,3 +390,11 @@ def _grid(stamps: Stamps) -> tuple[float, Stamps]:
     before = np.flatnonzero(periods > 1)
     period = float(steps[periods == 1].mean()) / 1e9  # gaps left out: a pause need not be a whole number of periods
     return period, np.stack((before, periods[before] - 1), axis=1)
+
+
+def _many(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def _has(number: int) -> str:
+    return "has" if number == 1 else "have"
