@@ -9,6 +9,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import rclpy
@@ -64,6 +65,19 @@ class Process:
             assert time.monotonic() < end, f"'{text}' never came: {self.output}"
             time.sleep(0.02)
         return self
+
+    def wait_for_handlers(self) -> "Process":
+        """Wait until it handles SIGTERM, which Python does not do on its own, and return the process."""
+        end = time.monotonic() + PATIENCE_S
+        while not self._caught() >> (signal.SIGTERM - 1) & 1:
+            assert self.popen.poll() is None, f"ended with {self.popen.returncode}: {self.output}"
+            assert time.monotonic() < end, "it never handled the signal"
+            time.sleep(0.01)
+        return self
+
+    def _caught(self) -> int:
+        status = Path(f"/proc/{self.popen.pid}/status").read_text()
+        return next(int(line.split()[1], 16) for line in status.splitlines() if line.startswith("SigCgt"))
 
     def send(self, number: signal.Signals) -> "Process":
         """Send a signal."""
@@ -128,6 +142,7 @@ class Graph:
             yield messages
         finally:
             self.node.destroy_subscription(subscription)
+            self._executor.spin_once(timeout_sec=0)  # only now does it let go
 
     @contextmanager
     def talking(self, kind: type, topic: str) -> Iterator[Callable[[Any], None]]:

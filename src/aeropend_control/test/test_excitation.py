@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from aeropend_sim.parameters import SAMPLE_PERIOD, load
 def holds(series):
     """(duty, samples) of each stretch of equal duty."""
     starts = np.append(np.flatnonzero(np.diff(series, prepend=np.nan)), len(series))
-    return [(series[start], end - start) for start, end in zip(starts, starts[1:], strict=False)]
+    return [(series[start], end - start) for start, end in pairwise(starts)]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -63,7 +65,9 @@ def test_staircase_goes_up_and_down_in_equal_stairs():
 def test_multisine_has_equal_lines_at_its_frequencies_and_nothing_else():
     duration = 2000 * SAMPLE_PERIOD
     frequencies = tuple(k / duration for k in (1, 3, 7, 20))
-    series = Excitation(kind="multisine", duration=duration, duty_min=0.1, duty_max=0.5, frequencies=frequencies).series()
+    series = Excitation(
+        kind="multisine", duration=duration, duty_min=0.1, duty_max=0.5, frequencies=frequencies
+    ).series()
     assert (series.min(), series.max()) == pytest.approx((0.1, 0.5))
     lines = np.abs(np.fft.rfft(series))[1:]
     strong = {1, 3, 7, 20}
