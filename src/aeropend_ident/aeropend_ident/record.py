@@ -20,9 +20,11 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
+from rclpy.validate_topic_name import validate_topic_name
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
@@ -62,7 +64,7 @@ TRUTH = {
 
 SETTINGS = {
     "storage": Setting("mcap", "file format", choices=tuple(PLUGINS)),
-    "duration": Setting(0.0, "end this long after the first message; 0: no end", "s", 0.0, 1e6),
+    "duration": Setting(0.0, "end this long after the first message of the rig; 0: no end", "s", 0.0, 1e6),
     "while_published": Setting("", "end when the last publisher of this topic has gone"),
     "truth": Setting(False, "record truth/joint_states and truth/armature too"),
     "topics": Setting("", "more topics to record, with commas between them"),
@@ -179,9 +181,10 @@ class Record(Node):
 
     def _resolve(self, topic: str) -> str:
         try:
-            return str(self.resolve_topic_name(topic))
-        except ValueError as error:
+            validate_topic_name(topic)
+        except InvalidTopicNameException as error:
             raise UserError(f"'{topic}' is no topic name") from error
+        return str(self.resolve_topic_name(topic))
 
     # ---- the thread ------------------------------------------------------------------------------------------------
 
@@ -215,6 +218,7 @@ class Record(Node):
         number = getattr(error, "errno", None)
         full = number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or "full" in str(error)
         what = "the disk is full" if full else getattr(error, "strerror", None) or str(error)
+        what = what.replace("disk I/O error", "the disk is full or fails")  # SQLite knows no more of some file systems
         if stored:
             return UserError(f"{self._out}: {what}: the recording ends here, {stored} messages are safe in it")
         shutil.rmtree(self._out, ignore_errors=True)
@@ -228,7 +232,7 @@ class Record(Node):
             self._writer.write(tap.connection, received, message)
             tap.count += 1
             tap.heard = time.monotonic()
-            if self._first is None:
+            if self._first is None and tap.topic != interface.DIAGNOSTICS:  # ours and other nodes' are always there
                 self._first = tap.heard
 
     def _connect(self, tap: Tap) -> Connection:

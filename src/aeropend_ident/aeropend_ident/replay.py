@@ -44,7 +44,8 @@ SETTINGS = {
     "loop": Setting(False, "begin again at the end"),
     "topics": Setting("", "only these, with commas between them, relative to the rig's namespace or full names"),
     "namespace": Setting("", "only the rig that was recorded in this namespace"),
-    "wait": Setting(5.0, "wait at most this long until every topic has a subscriber", "s", 0.0, 1e6),
+    "subscribers": Setting(1, "begin when every topic has this many", low=0, high=1000),
+    "wait": Setting(5.0, "but wait for them no longer than this", "s", 0.0, 1e6),
     "clock": Setting(0.0, "publish /clock with the recorded time this often; 0: not at all", "Hz", 0.0, 1e3),
     "stop_duty": Setting(True, "after a duty_command, end with duty 0"),
 }
@@ -188,6 +189,7 @@ class Replay(Node):
         settings = read_settings(self, SETTINGS, overrides(self))
         self._rate: float = settings["rate"]
         self._loop: bool = settings["loop"]
+        self._subscribers: int = settings["subscribers"]
         self._wait: float = settings["wait"]
         self._stop_duty: bool = settings["stop_duty"]
         topics = [topic.strip() for topic in settings["topics"].split(",") if topic.strip()]
@@ -258,9 +260,10 @@ class Replay(Node):
     def _await_listeners(self, end: threading.Event) -> bool:
         """Wait for discovery. False when it is time to end."""
         deadline = time.monotonic() + self._wait
-        while deaf := [p.topic_name for p in self._outlets.values() if not p.get_subscription_count()]:
+        while deaf := [p for p in self._outlets.values() if p.get_subscription_count() < self._subscribers]:
             if time.monotonic() >= deadline:
-                self.get_logger().warn(f"nobody listens to {', '.join(sorted(deaf))}")
+                counts = (f"{outlet.topic_name} {outlet.get_subscription_count()}" for outlet in deaf)
+                self.get_logger().warn(f"begins with few or no subscribers: {', '.join(sorted(counts))}")
                 break
             if end.wait(SLEEP_S):
                 return False
