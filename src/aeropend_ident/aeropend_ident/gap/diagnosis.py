@@ -1,0 +1,394 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole diagnosis of one rig: gap, place, effects, numbers, and how far the gap closes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from aeropend_sim.effects import CATALOGUE
+from aeropend_sim.parameters import MODEL_NAMES, Model
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from aeropend_ident.gap import gust as gusts
+from aeropend_ident.gap import shrink, where
+from aeropend_ident.gap.chain import BLOCKS, PLACE_OF_NUMBER, Chains, with_values
+from aeropend_ident.gap.fit import Fit, Unknown, fit
+from aeropend_ident.gap.signals import CHANNELS, Signals
+from aeropend_ident.gap.which import (
+    EFFECT_ODDS, Findings, Hypothesis, Weighed, initial_unknowns, number_unknowns, search,
+)
+
+Array = NDArray[np.float64]
+
+Z95 = 1.959964
+GOOD_ENOUGH = 1.3
+"""RMS of a residual, in units of a reading's noise, up to which the model explains a channel."""
+
+RANDOM_TORQUE = 0.35
+"""A torque on the arm passes as random while the state explains less than this share of it."""
+
+FALSE_CAPTURES = 0.02
+"""1/s of false speed periods that any rig may show."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found.
+
+    Attributes:
+        model: the nominal model. augmented: with refitted numbers and found effects.
+        signals: the recordings. before, after: channel -> (N,) free-run readings, per recording.
+        body: the content of `diagnosis.json` from `channels` on (contract section 5).
+        residuals: series for the report, name -> (M,).
+    """
+
+    model: Model
+    augmented: Model
+    signals: Sequence[Signals]
+    before: Sequence[Mapping[str, Array]]
+    after: Sequence[Mapping[str, Array]]
+    body: dict[str, object]
+    misfit: Mapping[str, Array]
+
+
+Progress = Callable[[str, float], None]
+"""Called with what is being done and the share (0..1) that is behind."""
+
+
+def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progress: Progress = lambda *_: None, *,
+             fit_nominal: bool = False) -> Diagnosis:
+    """Find where a model and a rig part, by which effect, and how far the gap closes.
+
+    Args:
+        model: the nominal model, with effects already known to be there.
+        recordings: one or more of one rig.
+        jobs: threads.
+        progress: told how far it is.
+        fit_nominal: the model's numbers are only a guess, good to a factor of three.
+    """
+    with threadpool_limits(1):  # the matrices are narrow: threads of the linear algebra only get in each other's way
+        return _diagnose(Chains(model, recordings, fit_nominal=fit_nominal), jobs, progress)
+
+
+def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
+    model, recordings = chains.model, [chain.signals for chain in chains.each]
+    findings = search(chains, jobs, lambda block, share: progress(f"weighing effects of the {block}", 0.7 * share))
+    progress("looking for chance", 0.7)
+    spikes = _spikes(recordings)
+    torque, misfit, variables = _random_torque(chains, findings)
+    progress("fitting the whole chain", 0.75)
+    values, sd = _joint(chains, findings)
+    initial = {n: v for n, v in values.items() if n.startswith("initial.")}
+    base_values = {n: v for f in findings.values() for n, v in f.base.values.items() if n.startswith("initial.")}
+    progress("measuring the gap", 0.9)
+    before = [shrink.free_run(model, s, chains.own(base_values, k)) for k, s in enumerate(recordings)]
+    after = [shrink.free_run(model, s, chains.own(values, k)) for k, s in enumerate(recordings)]
+    found = [h for f in findings.values() for h in f.effects]
+    scorer = _Scorer(chains, model, recordings, bool(spikes))
+    gap_before, gap_after = scorer.gap(before, known=False), scorer.gap(after)
+    floors = scorer.floors()
+    share, low, high = shrink.closed(gap_before, gap_after, floors)
+
+    groups = [(h.place, {u.name: _neutral(model, u.name) for u in h.starts[0]}) for h in found]
+    for place in dict.fromkeys(PLACE_OF_NUMBER.values()):
+        back = {n: model.model[n] for n in values if PLACE_OF_NUMBER.get(n) == place
+                and n not in {h.number for h in found}}
+        if back:
+            groups.append((place, back))
+    ablated = {h.name: max(scorer.squared({**values, **dict(back)}) - scorer.squared(values), 0.0)
+               for h, (_, back) in zip(found, groups, strict=False)}
+    unexplained = _unexplained(findings, scorer, gap_after, floors)
+    excused = set()
+    if torque is not None:
+        ablated["gust"] = unexplained.pop("arm", 0.0)
+        groups.append(("arm", {}))
+        excused.add("gust")
+    if spikes is not None:
+        ablated["speed_spikes"] = max(gap_before.rms["omega"] ** 2 - gap_after.rms["omega"] ** 2, 0.0)
+    parts = where.shares(scorer.squared, values, groups, unexplained)
+    for name in ("gust", "speed_spikes"):
+        if name in ablated:
+            parts = _add_share(parts, CATALOGUE[name].place, ablated[name], scorer.squared(values))
+
+    candidates = _candidates(findings, values, sd, torque, spikes, scorer, gap_after.total)
+    order = sorted(ablated, key=lambda name: -ablated[name])
+    effects = list(dict.fromkeys(name.partition(":")[0] for name in order))
+    left = _left(findings, torque is not None)
+    verdict = effects[0] if effects else "none"
+    reasons = [f"{c} is off by {x:.1f} times a reading's noise" for c, x in left.items() if x > GOOD_ENOUGH]
+    if reasons and (not effects or (share is not None and share < 0.5 and not (torque or spikes))):
+        verdict = "unknown"
+    if verdict == "none":
+        place = "none"
+    elif verdict == "unknown":
+        place = max(parts, key=lambda p: parts[p])
+    else:
+        place = next((h.place for h in found if h.name == order[0]), None) or CATALOGUE[order[0]].place
+
+    augmented = _augmented(model, values, torque, spikes)
+    names = [c for c in CHANNELS if c in gap_before.rms]
+    body: dict[str, object] = {
+        "channels": {c: {"unit": CHANNELS[c], "gap": gap_before.rms[c], "floor": floors[c],
+                         "gap_after": gap_after.rms[c]} for c in names},
+        "where": {"place": place, "share": parts, "regions": where.regions(misfit, variables)},
+        "which": {"verdict": verdict, "effects": effects, "candidates": candidates,
+                  "numbers": {n: {"nominal": model.model[n], **_interval(values[n], sd[n])}
+                              for n in MODEL_NAMES if n in values},
+                  "unexplained": reasons,
+                  "not_separable": _not_separable(findings), "next_experiment": None},
+        "shrink": {"gap": gap_before.total, "gap_after": gap_after.total, "floor": scorer.bottom(gap_before, floors),
+                   "closed": share, "low": low, "high": high},
+    }
+    progress("done", 1.0)
+    return Diagnosis(model, augmented, recordings, before, after, body, {"misfit": misfit, **variables})
+
+
+class _Scorer:
+    """Measures the gap of models on the held-out part of every recording."""
+
+    def __init__(self, chains: Chains, model: Model, recordings: Sequence[Signals], spikes: bool) -> None:
+        self.chains, self.model, self.recordings, self.spikes = chains, model, recordings, spikes
+
+    def gap(self, readings: Sequence[Mapping[str, Array]], known: bool = True) -> shrink.Gap:
+        """The gap over all recordings; `known`: false periods of the speed are told apart if they were found."""
+        gaps = [shrink.gap(r, s, s.train, len(s), _false(s) if known and self.spikes else None)
+                for r, s in zip(readings, self.recordings, strict=True)]
+        if len(gaps) == 1:
+            return gaps[0]
+        channels = [c for c in CHANNELS if all(c in g.rms for g in gaps)]
+        rms = {c: math.sqrt(float(np.mean([g.rms[c] ** 2 for g in gaps]))) for c in channels}
+        spread = {c: math.sqrt(float(np.mean([g.spread[c] ** 2 for g in gaps]))) for c in channels}
+        columns = [[list(g.rms).index(c) for c in channels] for g in gaps]
+        windows = np.concatenate([g.windows[:, i] for g, i in zip(gaps, columns, strict=True)])
+        return shrink.Gap(rms, spread, windows)
+
+    def of(self, values: Mapping[str, float]) -> shrink.Gap:
+        """The gap of the model with these values."""
+        return self.gap([shrink.free_run(self.model, s, self.chains.own(values, k))
+                         for k, s in enumerate(self.recordings)])
+
+    def squared(self, values: Mapping[str, float]) -> float:
+        """The squared total gap of the model with these values."""
+        return self.of(values).total ** 2
+
+    def floors(self) -> dict[str, float]:
+        """The floor by channel over all recordings."""
+        each = [shrink.floor(s, s.train, len(s)) for s in self.recordings]
+        return {c: math.sqrt(float(np.mean([f[c] ** 2 for f in each]))) for c in CHANNELS}
+
+    @staticmethod
+    def bottom(gap: shrink.Gap, floors: Mapping[str, float]) -> float:
+        """The floor of the total gap."""
+        return math.sqrt(float(np.mean([(floors[c] / gap.spread[c]) ** 2 for c in gap.rms])))
+
+
+def _false(s: Signals) -> NDArray[np.bool_]:
+    """Samples (N,) at which a false period is held, or a single speed stands out."""
+    out = np.zeros(len(s), dtype=bool)
+    p = s.pulses
+    if p is not None:
+        ends = np.append(p.index[1:], len(s))
+        for a, b in zip(p.index[p.false], ends[p.false], strict=True):
+            out[a:b] = True
+    elif s.has("omega"):
+        from aeropend_ident.gap.chain import robust
+
+        out = np.isfinite(s.omega) & np.isnan(robust(s.omega, s.sigma["omega"]))
+    return out
+
+
+def _spikes(recordings: Sequence[Signals]) -> Weighed | None:
+    """Whether false speed periods come more often than any rig may show."""
+    count, time = 0, 0.0
+    for s in recordings:
+        flags = _false(s)
+        count += int(np.sum(np.diff(flags[: s.train].astype(int)) == 1))
+        time += s.train * s.period
+    if count < 3:
+        return None
+    expected = FALSE_CAPTURES * time
+    gain = count * math.log(count / expected) - (count - expected) + math.log(EFFECT_ODDS)
+    if gain < 0.0:
+        return None
+    name = "speed_spikes.rate"
+    rate, sd = count / time, math.sqrt(count) / time
+    return Weighed(Hypothesis("speed_spikes"), Fit({name: rate}, {name: sd}, {}, {}, {}, 0.0), gain,
+                   1.0 / (1.0 + math.exp(-min(gain, 500.0))))
+
+
+def _random_torque(chains: Chains, findings: Mapping[str, Findings]) -> tuple[Weighed | None, Array, dict[str, Array]]:
+    """Judge `gust` on what the arm leaves, and the unexplained signal that regions are drawn from."""
+    block = max(BLOCKS, key=lambda b: _misfit_of(findings[b].base))
+    chain = chains.each[0]
+    s = chain.signals
+    final = findings["arm"].final
+    torque: Weighed | None = None
+    own = chains.own(final.values, 0)
+    n = with_values(chains.model, own).numbers()
+
+    def fitted(values: Mapping[str, float]) -> gusts.Gust:
+        return gusts.fit_gust((s.theta - chain.arm(values))[: s.train], s.theta[: s.train], n["mgd_over_J"],
+                              n["c_over_J"], s.sigma["theta"], s.period)
+
+    if final.scale.get("theta", 1.0) > GOOD_ENOUGH:
+        g = fitted(own)
+        theta, speed = np.nan_to_num(s.theta[g.index]), chain.speed[g.index]
+        rate = np.gradient(_calm(theta), g.index * s.period)
+        columns = [np.sin(theta), theta, np.abs(theta), rate, np.abs(rate) * rate, np.tanh(rate / 0.05), speed,
+                   speed**2, speed * rate, np.gradient(speed, g.index * s.period)]
+        if g.gain > 0.0 and gusts.follows_state(g.torque, columns) < RANDOM_TORQUE:
+            values = {"gust.sigma": g.sigma, "gust.tau": g.tau}
+            sd = {"gust.sigma": g.sigma * g.sigma_sd, "gust.tau": g.tau * g.tau_sd}
+            torque = Weighed(Hypothesis("gust"), Fit(values, sd, {}, {}, {}, 0.0), g.gain, 1.0)
+    if block == "actuator":
+        misfit, index = s.v_a - chain.actuator(own), np.arange(len(s))
+    elif block == "motor":
+        misfit = s.i_a - chain.motor(chains.own(findings["motor"].base.values, 0))[0]
+        index = np.arange(len(s))
+    else:
+        g = fitted(chains.own(findings["arm"].base.values, 0))
+        misfit, index = g.torque, g.index
+    rate = np.gradient(_calm(np.nan_to_num(s.theta)), s.period)
+    variables = {"theta": s.theta[index], "theta_dot": rate[index], "omega": chain.speed[index],
+                 "i_a": s.i_a[index], "duty": s.duty[index], "t": index * s.period}
+    return torque, misfit[: len(index)], variables
+
+
+def _calm(x: Array) -> Array:
+    """A moving mean long enough to take a derivative of quantised angles."""
+    kernel = np.hanning(27)[1:-1]
+    return np.convolve(np.pad(x, 12, mode="edge"), kernel / kernel.sum(), mode="valid")
+
+
+def _misfit_of(f: Fit) -> float:
+    return max((float(np.mean(r * r)) for r in f.residuals.values()), default=0.0)
+
+
+def _left(findings: Mapping[str, Findings], torque: bool) -> dict[str, float]:
+    """Channel -> RMS of what is left in its part of the cut chain, in units of a reading's noise."""
+    left: dict[str, float] = {}
+    for block, f in findings.items():
+        for channel, r in f.final.residuals.items():
+            if not (torque and block == "arm"):
+                name = channel.partition("@")[0]
+                left[name] = max(left.get(name, 0.0), float(np.sqrt(np.mean(r * r))))
+    return left
+
+
+def _unexplained(findings: Mapping[str, Findings], scorer: _Scorer, after: shrink.Gap, floors: Mapping[str, float]
+                 ) -> dict[str, float]:
+    """Place -> squared gap that is left there: what the cut chain leaves above the floor."""
+    home = {"v_a": "actuator", "i_a": "electrical", "omega": "rotor", "theta": "arm"}
+    left: dict[str, float] = {}
+    for f in findings.values():
+        for channel, r in f.final.residuals.items():
+            name = channel.partition("@")[0]
+            excess = float(np.mean(r * r)) - GOOD_ENOUGH**2
+            if excess > 0.0 and name in after.spread:
+                left[home[name]] = excess * (floors[name] / after.spread[name]) ** 2 / len(after.spread)
+    return left
+
+
+def _add_share(parts: dict[str, float], place: str, amount: float, _: float) -> dict[str, float]:
+    total = sum(parts.values()) + amount
+    return {p: (x + (amount if p == place else 0.0)) / total if total > 0.0 else 0.0 for p, x in parts.items()}
+
+
+def _joint(chains: Chains, findings: Mapping[str, Findings]) -> tuple[dict[str, float], dict[str, float]]:
+    """Fit everything found and every number together, on the whole chain from the duty to all channels."""
+    unknowns: dict[str, Unknown] = {}
+    start: dict[str, float] = {}
+    for block, f in findings.items():
+        for u in [*initial_unknowns(chains, block), *number_unknowns(chains, block)]:
+            unknowns[u.name] = u
+        for h in f.effects:
+            unknowns.update({u.name: u for u in h.starts[0]})
+        start.update(f.final.values)
+
+    def residuals(values: dict[str, float]) -> dict[str, Array]:
+        out: dict[str, Array] = {}
+        for k, chain in enumerate(chains.each):
+            s = chain.signals
+            readings = shrink.free_run(chains.model, s, chains.own(values, k))
+            suffix = f"@{k}" if k else ""
+            for channel in ("theta", "i_a", "v_a"):
+                e = (s.channel(channel) - readings[channel])[: s.train]
+                out[channel + suffix] = e[np.isfinite(e)] / s.sigma[channel]
+            p = s.pulses
+            if p is not None:
+                use = p.index[(p.index < s.train) & ~p.false]
+                sigma = p.sigma[(p.index < s.train) & ~p.false]
+                out["omega" + suffix] = (s.omega[use] - readings["omega"][use]) / sigma
+            elif s.has("omega"):
+                e = np.where(_false(s), np.nan, s.omega - readings["omega"])[: s.train]
+                out["omega" + suffix] = e[np.isfinite(e)] / s.sigma["omega"]
+        return out
+
+    begun = [Unknown(u.name, u.mean, u.sd, u.low, u.high, start.get(u.name, u.start), u.log)
+             for u in unknowns.values()]
+    joint = fit(residuals, begun, rounds=3, steps=2)
+    return joint.values, joint.sd
+
+
+def _neutral(model: Model, name: str) -> float:
+    """The value at which something found is absent."""
+    owner, _, parameter = name.partition(".")
+    return CATALOGUE[owner].parameters[parameter].neutral if parameter else model.model[owner]
+
+
+def _interval(value: float, sd: float) -> dict[str, float]:
+    return {"value": value, "low": value - Z95 * sd, "high": value + Z95 * sd}
+
+
+def _candidates(findings: Mapping[str, Findings], values: Mapping[str, float], sd: Mapping[str, float],
+                torque: Weighed | None, spikes: Weighed | None, scorer: _Scorer, gap_after: float
+                ) -> list[dict[str, object]]:
+    """Every hypothesis that was weighed, the most probable first; a found one with its intervals of the joint fit."""
+    rows: dict[str, dict[str, object]] = {}
+    for f in findings.values():
+        accepted = {h.name for h in f.effects}
+        for round_ in [*f.found, f.rivals]:
+            for w in round_:
+                h = w.hypothesis
+                mine = h.name in accepted
+                if h.name in rows and (rows[h.name]["probability"] >= w.probability or mine):  # type: ignore[operator]
+                    continue
+                if mine and w is not round_[0]:
+                    continue
+                names = [u.name for u in h.starts[0]]
+                source, spread = (values, sd) if mine else (w.fit.values, w.fit.sd)
+                whole = {**values, **w.fit.values}
+                rows[h.name] = {
+                    "effect": h.effect, "place": h.place, "probability": w.probability,
+                    "parameters": {n.rpartition(".")[2]: _interval(source[n], spread[n]) for n in names},
+                    "gap_after": gap_after if mine else (scorer.of(whole).total if w.probability > 1e-3 else None)}
+    for extra in (torque, spikes):
+        if extra is not None:
+            rows[extra.hypothesis.name] = {
+                "effect": extra.hypothesis.effect, "place": extra.hypothesis.place, "probability": extra.probability,
+                "parameters": {n.partition(".")[2]: _interval(v, extra.fit.sd[n]) for n, v in extra.fit.values.items()},
+                "gap_after": gap_after}
+    return sorted(rows.values(), key=lambda row: -row["probability"])  # type: ignore[operator]
+
+
+def _not_separable(findings: Mapping[str, Findings]) -> list[list[str]]:
+    """Pairs of effects that this recording cannot tell apart: the first and rivals nearly as probable."""
+    pairs = []
+    for f in findings.values():
+        for round_ in [*f.found, f.rivals]:
+            if round_ and round_[0].probability > 0.05:
+                first = round_[0]
+                pairs += [[first.hypothesis.effect, w.hypothesis.effect] for w in round_[1:]
+                          if w.probability > 0.05 and w.hypothesis.effect != first.hypothesis.effect]
+    return pairs
+
+
+def _augmented(model: Model, values: Mapping[str, float], torque: Weighed | None, spikes: Weighed | None) -> Model:
+    """The model with all that was found, ready for the plant node."""
+    extra = {n: v for w in (torque, spikes) if w is not None for n, v in w.fit.values.items()}
+    m = with_values(model, {**{n: v for n, v in values.items() if not n.startswith("initial.")}, **extra})
+    return Model(f"{model.name}, augmented", m.model, m.sensing, m.effects)

@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fit a hypothesis to a block of channels, numbers and effects together, and weigh it against others.
+
+Every number of the model carries a prior, so that it cannot wander off to cover for a missing effect. A residual that
+is larger than the noise or coloured counts for less: the standard deviation is inflated to what is seen and the samples
+are thinned to as many as are independent. So a wrong hypothesis cannot buy a precise fit with absurd numbers, and the
+right one, whose residual is white and as small as the noise, is weighed in full.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
+
+Array = NDArray[np.float64]
+Residuals = Mapping[str, Array]
+"""Channel -> residual in units of its standard deviation, missing samples left out."""
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A number to be fitted.
+
+    Attributes:
+        name: of the number. mean, sd: of its prior, which is normal, or log-normal if `log` (then sd is that of the
+            logarithm and mean, low and high are positive).
+        low, high: bounds. start: where the search starts; the mean by default.
+    """
+
+    name: str
+    mean: float
+    sd: float
+    low: float = -np.inf
+    high: float = np.inf
+    start: float | None = None
+    log: bool = False
+
+    def to_standard(self, value: float) -> float:
+        """The value as a standard normal number."""
+        if self.log:
+            return (np.log(value) - np.log(self.mean)) / self.sd if value > 0.0 else -np.inf
+        return (value - self.mean) / self.sd
+
+    def value(self, z: float) -> float:
+        """The inverse of `to_standard`."""
+        return float(self.mean * np.exp(self.sd * z)) if self.log else float(self.mean + self.sd * z)
+
+    def slope(self, z: float) -> float:
+        """d value / d z."""
+        return self.value(z) * self.sd if self.log else self.sd
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted hypothesis.
+
+    Attributes:
+        values: name -> estimate.
+        sd: name -> standard deviation.
+        residuals: channel -> (N,) in units of the noise, at the estimate.
+        scale: channel -> RMS of the residual, at least 1.
+        independent: channel -> number of independent samples.
+        prior: log density of the estimate under the prior, less what the data's precision costs (Laplace).
+    """
+
+    values: dict[str, float]
+    sd: dict[str, float]
+    residuals: dict[str, Array]
+    scale: dict[str, float]
+    independent: dict[str, float]
+    prior: float
+
+    def evidence(self, independent: Mapping[str, float]) -> float:
+        """Log evidence of the hypothesis when a channel counts as so many independent samples."""
+        total = self.prior
+        for channel, r in self.residuals.items():
+            s2 = self.scale[channel] ** 2
+            total -= 0.5 * independent[channel] * (np.log(s2) + float(np.mean(r * r)) / s2)
+        return total
+
+
+def independent_samples(r: Array) -> float:
+    """How many independent samples a residual (N,) is worth: N over its integrated autocorrelation time."""
+    n = len(r)
+    if n < 16:
+        return float(n)
+    size = next_fast_len(2 * n, real=True)
+    correlation = irfft(np.abs(rfft(r, size)) ** 2, size)[: n // 4]
+    if correlation[0] <= 0.0:
+        return float(n)
+    correlation = correlation / correlation[0]
+    running = 1.0 + 2.0 * np.cumsum(correlation[1:])
+    # Sokal's window: stop where the lag exceeds five times the time found so far
+    lags = np.arange(1, len(correlation))
+    stop = np.flatnonzero(lags >= 5.0 * running)
+    time = running[stop[0]] if len(stop) else running[-1]
+    return float(n / max(time, 1.0))
+
+
+class Search:
+    """A point in the space of the unknowns, in standard units, with its residuals and their weights."""
+
+    def __init__(self, residuals: Callable[[dict[str, float]], Residuals], unknowns: Sequence[Unknown]) -> None:
+        self.residuals, self.unknowns = residuals, tuple(unknowns)
+        self.low = np.array([u.to_standard(u.low) for u in unknowns])
+        self.high = np.array([u.to_standard(u.high) for u in unknowns])
+        self.z = np.array([u.to_standard(u.mean if u.start is None else u.start) for u in unknowns])
+        self.z = np.clip(self.z, self.low, self.high)
+        self.current = self.at(self.z)
+        self.renew_weights()
+
+    def at(self, z: Array) -> dict[str, Array]:
+        """Residuals at a point in standard units."""
+        values = {u.name: u.value(x) for u, x in zip(self.unknowns, z, strict=True)}
+        return {k: np.asarray(r) for k, r in self.residuals(values).items() if len(r)}
+
+    def renew_weights(self) -> None:
+        """Inflate the noise and thin the samples to what the residuals at this point show."""
+        self.scale = {k: max(1.0, float(np.sqrt(np.mean(r * r)))) for k, r in self.current.items()}
+        self.independent = {k: independent_samples(r) for k, r in self.current.items()}
+        self.weight = {k: np.sqrt(self.independent[k] / len(r)) / self.scale[k] for k, r in self.current.items()}
+
+    def stack(self, residuals: Residuals) -> Array:
+        """Weighted residuals of all channels as one vector."""
+        return np.concatenate([self.weight[k] * residuals[k] for k in self.weight] or [np.zeros(0)])
+
+    def column(self, j: int, step: float = 1e-4) -> Array:
+        """Derivative of the stacked residuals by unknown j, by a difference towards the inside of the bounds."""
+        step = -step if self.z[j] + step > self.high[j] else step
+        z = self.z.copy()
+        z[j] += step
+        return (self.stack(self.at(z)) - self.stack(self.current)) / step
+
+    def jacobian(self) -> Array:
+        """Derivative of the stacked residuals by every unknown, one row an unknown."""
+        return np.array([self.column(j) for j in range(len(self.z))]).reshape(len(self.z), -1)
+
+    def improve(self, steps: int) -> Array:
+        """Levenberg-Marquardt steps with the weights as they are; returns the information matrix, prior included."""
+        damping = 1e-3
+        information = np.eye(len(self.z))
+        for _ in range(steps):
+            r = self.stack(self.current)
+            jacobian = self.jacobian()
+            information = jacobian @ jacobian.T + np.eye(len(self.z))
+            gradient = jacobian @ r + self.z
+            cost = float(r @ r + self.z @ self.z)
+            gained = 0.0
+            while damping < 1e6:
+                step = np.linalg.solve(information + damping * np.diag(np.diag(information)), -gradient)
+                z = np.clip(self.z + step, self.low, self.high)
+                trial = self.at(z)
+                r = self.stack(trial)
+                new = float(r @ r + z @ z)
+                if np.isfinite(new) and new < cost:
+                    gained = cost - new
+                    self.z, self.current = z, trial
+                    damping *= 0.2
+                    break
+                damping *= 8.0
+            if gained < 1e-2 + 1e-4 * cost:
+                break
+        return information
+
+
+def fit(residuals: Callable[[dict[str, float]], Residuals], unknowns: Sequence[Unknown],
+        rounds: int = 10, steps: int = 4) -> Fit:
+    """Maximum a posteriori fit with the noise inflated to what the residual shows.
+
+    Args:
+        residuals: values by name -> residuals in units of the noise.
+        unknowns: what is fitted.
+        rounds: how often the weights are renewed at most; steps: Levenberg-Marquardt steps in each.
+    """
+    search = Search(residuals, unknowns)
+    information = np.eye(len(search.z))
+    for _ in range(rounds):
+        information = search.improve(steps)
+        before = search.scale
+        search.renew_weights()
+        if all(abs(search.scale[k] - before[k]) < 0.01 * before[k] for k in before):
+            break
+    z, covariance = search.z, np.linalg.inv(information)
+    prior = -0.5 * float(z @ z) - 0.5 * float(np.linalg.slogdet(information)[1])
+    values = {u.name: u.value(x) for u, x in zip(unknowns, z, strict=True)}
+    sd = {u.name: abs(u.slope(x)) * float(np.sqrt(v)) for u, x, v in zip(unknowns, z, np.diag(covariance), strict=True)}
+    return Fit(values, sd, search.current, search.scale, search.independent, prior)
+
+
+def screen(residuals: Callable[[dict[str, float]], Residuals], base: Fit, known: Sequence[Unknown],
+           additions: Sequence[Sequence[Unknown]]) -> list[float]:
+    """How much of the misfit each addition would take away if everything were linear, by one least-squares solve each.
+
+    Args:
+        residuals: as for `fit`.
+        base: the fit without additions, over `known`.
+        known: its unknowns.
+        additions: groups of unknowns, each tried at its starts.
+
+    Returns:
+        Share of the weighted sum of squares that is left, one an addition; 1 where nothing changes.
+    """
+    search = Search(residuals, [replace(u, start=base.values[u.name]) for u in known])
+    r = search.stack(search.current)
+    jacobian = search.jacobian()
+    cost = float(r @ r + search.z @ search.z)
+    left = []
+    for group in additions:
+        values = {**base.values, **{u.name: u.mean if u.start is None else u.start for u in group}}
+        changed = {k: np.asarray(x) for k, x in residuals(values).items() if len(x)}
+        column = search.stack({k: changed[k] for k in search.weight}) - r
+        if not np.isfinite(column).all() or not column.any():
+            left.append(1.0)
+            continue
+        rows = np.vstack([jacobian, column])
+        information = rows @ rows.T + np.diag([*np.ones(len(search.z)), 1e-9 * float(column @ column)])
+        solution = np.linalg.solve(information, rows @ r + np.append(search.z, 0.0))
+        left.append(max(cost - float((rows @ r + np.append(search.z, 0.0)) @ solution), 0.0) / max(cost, 1e-300))
+    return left

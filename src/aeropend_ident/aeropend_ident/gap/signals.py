@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a recording offers to the diagnosis: channels on a uniform grid, their noise, and the pulses behind the speed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeropend_ident.recording import Recording, RecordingError
+
+Array = NDArray[np.float64]
+
+CHANNELS = {"theta": "rad", "omega": "rad/s", "i_a": "A", "v_a": "V"}
+"""The measured channels and their units, in the order of every table."""
+
+MINIMUM_DURATION = 5.0
+"""s of data below which nothing is said."""
+
+
+@dataclass(frozen=True)
+class Pulses:
+    """The speed as its pulses gave it: one entry for each interval that completed.
+
+    Attributes:
+        index: (M,) sample in which the new speed first shows.
+        time: (M,) s, estimated end of the interval; at most one sample early.
+        period: (M,) s, its length.
+        omega: (M,) rad/s, mean speed over it.
+        sigma: (M,) rad/s, what its timing leaves uncertain.
+        false: (M,) the period does not fit the time that passed since the pulse before: a false capture.
+    """
+
+    index: NDArray[np.int64]
+    time: Array
+    period: Array
+    omega: Array
+    sigma: Array
+    false: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Signals:
+    """One recording on the grid of its samples.
+
+    Attributes:
+        period: s between samples.
+        duty: (N,) applied duty, 0..1, held where a sample is missing.
+        theta, omega, i_a, v_a: (N,) measured, NaN where missing.
+        sigma: channel -> standard deviation of a reading (noise and quantisation).
+        pulses: the intervals behind omega, or None where the speed is sampled directly or not at all.
+        train: number of samples that models are fitted to; the rest is held out.
+        notes: what a person should know about the data.
+    """
+
+    period: float
+    duty: Array
+    theta: Array
+    omega: Array
+    i_a: Array
+    v_a: Array
+    sigma: Mapping[str, float]
+    pulses: Pulses | None
+    train: int
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.duty)
+
+    def channel(self, name: str) -> Array:
+        """A measured channel by name, (N,)."""
+        return np.asarray(getattr(self, name))
+
+    def has(self, name: str) -> bool:
+        """Whether a channel was measured at all."""
+        return bool(np.isfinite(self.channel(name)).any())
+
+
+def from_recording(recording: Recording, sensing: Mapping[str, float], held_out: float = 0.3) -> Signals:
+    """Put a recording on the uniform grid of its samples.
+
+    Args:
+        recording: what was read.
+        sensing: the model's measurement chain.
+        held_out: share of the recording at its end that models are not fitted to.
+
+    Raises:
+        RecordingError: too short, no angle, or no duty.
+    """
+    index = np.rint((recording.stamp_ns - recording.stamp_ns[0]) / (recording.period * 1e9)).astype(np.int64)
+    n = int(index[-1]) + 1
+    period = float(recording.stamp_ns[-1] - recording.stamp_ns[0]) * 1e-9 / max(n - 1, 1)
+    columns = {}
+    for name in (*CHANNELS, "duty"):
+        columns[name] = np.full(n, np.nan)
+        columns[name][index] = getattr(recording, name)
+    return from_arrays(columns, period, sensing, held_out, recording.path, recording.notes)
+
+
+def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[str, float], held_out: float = 0.3,
+                name: str = "recording", notes: tuple[str, ...] = ()) -> Signals:
+    """As `from_recording`, from arrays (N,) by channel name and `duty`, on a uniform grid of `period` seconds.
+
+    Raises:
+        RecordingError: too short, no angle, or no duty.
+    """
+    n = len(columns["duty"])
+    if n * period < MINIMUM_DURATION:
+        raise RecordingError(f"{name}: {n * period:.1f} s of samples; a diagnosis needs {MINIMUM_DURATION:g} s or more")
+    if not np.isfinite(columns["theta"]).any():
+        raise RecordingError(f"{name}: no arm angle was measured (joint_states, position of 'arm'); nothing to compare")
+    if not np.isfinite(columns["duty"]).any():
+        raise RecordingError(f"{name}: no duty was recorded (armature.percentage or duty_command); "
+                             "without it the model has no input")
+    duty = _held(columns["duty"])
+    train = max(1, int(round(n * (1.0 - held_out))))
+    pulses = None
+    if sensing["speed_pulses_per_rev"] > 0.0 and np.isfinite(columns["omega"]).any():
+        pulses = find_pulses(columns["omega"], period, sensing)
+    lsb = {"theta": "angle", "i_a": "current", "v_a": "voltage"}
+    sigma = {"omega": max(sensing["speed_noise"], _noise_of(columns["omega"]))}
+    for channel, key in lsb.items():
+        stated = math.hypot(sensing[f"{key}_noise"], sensing[f"{key}_lsb"] / math.sqrt(12.0))
+        seen = _noise_of(columns[channel])
+        sigma[channel] = seen if seen > 2.0 * stated else stated  # quantisation spoils what is seen of a small noise
+    return Signals(period, duty, columns["theta"], columns["omega"], columns["i_a"], columns["v_a"], sigma, pulses,
+                   train, notes)
+
+
+def _held(x: Array) -> Array:
+    """Each missing value takes the one before it; those before the first take the first."""
+    known = np.flatnonzero(np.isfinite(x))
+    return x[known[np.maximum(np.searchsorted(known, np.arange(len(x)), side="right") - 1, 0)]]
+
+
+def _noise_of(x: Array) -> float:
+    """White noise of a channel from its second differences, robust against steps; a millionth of its range at least."""
+    x = x[np.isfinite(x)]
+    if len(x) < 10:
+        return 1e-6
+    return max(float(np.median(np.abs(np.diff(x, 2)))) / 0.6745 / math.sqrt(6.0), 1e-6 * float(np.ptp(x)), 1e-9)
+
+
+def find_pulses(omega: Array, period: float, sensing: Mapping[str, float]) -> Pulses:
+    """Recover the intervals between pulses from a held speed (N,) sampled every `period` s."""
+    turn = 2.0 * math.pi / sensing["speed_pulses_per_rev"]
+    held = _held(omega)
+    changes = np.flatnonzero(np.diff(held) != 0.0) + 1
+    at = changes[held[changes] > 0.0]
+    speed = held[at]
+    length = turn / speed if len(at) else np.zeros(0)
+    elapsed = np.diff(at, prepend=-(10**9)) * period
+    slack = 1.01 * period + 2.0 * sensing["speed_tick"]
+    before = np.concatenate([[1e9], length[:-1]])
+    # a period repeated to the tick does not show: whole multiples of the one before may have passed unseen
+    silent = np.maximum(np.rint((elapsed - length) / before), 0.0)
+    false = np.abs(elapsed - length - silent * before) > slack
+    if len(at):
+        false[0] = False
+    false &= elapsed < 0.5
+    time = (at - 0.5) * period
+    slope = np.gradient(speed, time) if len(at) > 2 else np.zeros(len(at))
+    tick = np.maximum(sensing["speed_tick"], 1e-6) * speed / np.maximum(length, 1e-9) if len(at) else np.zeros(0)
+    sigma = np.sqrt(tick**2 + sensing["speed_noise"] ** 2 + (0.3 * period * slope) ** 2 + 1e-6 * speed**2)
+    return Pulses(at, time, length, speed, sigma, false)

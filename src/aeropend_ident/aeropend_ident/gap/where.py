@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where: the share of each part of the chain in the gap, and the region of operation in which it arises."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+import numpy as np
+from aeropend_sim.effects import PLACES
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+BINS = 12
+NOTEWORTHY = 0.15
+"""A region is named when its share of the misfit exceeds its share of the time by this much."""
+
+
+def shares(squared_gap: Callable[[Mapping[str, float]], float], values: Mapping[str, float],
+           groups: Iterable[tuple[str, Mapping[str, float]]], unexplained: Mapping[str, float]) -> dict[str, float]:
+    """Share of each place: how much of the gap comes back when what was found there is taken out again.
+
+    Args:
+        squared_gap: values -> squared gap of the augmented model with these values.
+        values: everything found.
+        groups: (place, the values that take one finding back to nominal), several for a place allowed.
+        unexplained: place -> squared gap that nothing found explains.
+    """
+    total = dict.fromkeys(PLACES, 0.0)
+    best = squared_gap(values)
+    for place, reverted in groups:
+        total[place] += max(squared_gap({**values, **reverted}) - best, 0.0)
+    for place, amount in unexplained.items():
+        total[place] += max(amount, 0.0)
+    everything = sum(total.values())
+    return {place: (x / everything if everything > 0.0 else 0.0) for place, x in total.items()}
+
+
+def regions(misfit: Array, variables: Mapping[str, Array], most: int = 3) -> list[dict[str, float | str]]:
+    """The ranges of each variable in which the misfit concentrates, most concentrated first.
+
+    Args:
+        misfit: (M,) any measure with sign; its square is what is shared out.
+        variables: name -> (M,).
+        most: how many at most.
+
+    Returns:
+        variable, low, high, share of the squared misfit, and share of the time.
+    """
+    energy = np.nan_to_num(misfit) ** 2
+    if energy.sum() <= 0.0:
+        return []
+    found = []
+    for name, x in variables.items():
+        known = np.isfinite(x)
+        edges = np.unique(np.quantile(x[known], np.linspace(0.0, 1.0, BINS + 1))) if known.sum() > BINS else []
+        if len(edges) < 4:
+            continue
+        which = np.clip(np.searchsorted(edges, x[known], side="right") - 1, 0, len(edges) - 2)
+        share = np.bincount(which, energy[known], len(edges) - 1)
+        share = share / max(share.sum(), 1e-300)
+        time = np.bincount(which, minlength=len(edges) - 1) / known.sum()
+        a, b = _best_run(share - time)
+        found.append({"variable": name, "low": float(edges[a]), "high": float(edges[b + 1]),
+                      "share": float(share[a:b + 1].sum()), "time": float(time[a:b + 1].sum())})
+    found.sort(key=lambda r: r["time"] - r["share"])  # type: ignore[operator]
+    return [r for r in found if r["share"] - r["time"] > NOTEWORTHY][:most]  # type: ignore[operator]
+
+
+def _best_run(x: Array) -> tuple[int, int]:
+    """First and last index of the contiguous run with the largest sum (Kadane)."""
+    best, at, total, start = -np.inf, (0, 0), 0.0, 0
+    for j, value in enumerate(x):
+        if total <= 0.0:
+            total, start = 0.0, j
+        total += value
+        if total > best:
+            best, at = total, (start, j)
+    return at
