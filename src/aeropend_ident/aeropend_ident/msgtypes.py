@@ -32,13 +32,13 @@ def learn(typestore: Typestore, msgtype: str) -> None:
     """
     if msgtype in typestore.types:
         return
-    from ament_index_python.packages import get_package_share_directory
-
     package, _, name = msgtype.partition("/msg/")
     try:
+        from ament_index_python.packages import get_package_share_directory
+
         file = Path(get_package_share_directory(package)) / "msg" / f"{name}.msg"
         types = get_types_from_msg(file.read_text(encoding="utf-8"), msgtype)
-    except Exception as error:  # ament's, the file system's and the parser's own
+    except Exception as error:  # there may be no ROS; ament's, the file system's and the parser's own
         raise LookupError(f"the definition of message type {msgtype} cannot be had: {error}") from error
     for _, fields in types.values():
         for _, field in fields:

@@ -31,7 +31,7 @@ PLUGINS = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 _CRC_OFFSET = 33  # of the checksum in a chunk record
 
 
-class _Ending(io.RawIOBase):
+class _Ending:
     """What McapWriter writes to: held in memory, and put on disk in one go when the writer closes it.
 
     What was written from `begin` to `close` is the ending; what is written after that takes its place.
@@ -46,11 +46,13 @@ class _Ending(io.RawIOBase):
         self._kept = 0  # bytes of the buffer that come before the ending
         self._last = b""  # the ending that is on disk, at _start
 
-    def write(self, data: bytes) -> int:  # type: ignore[override]
+    def write(self, data: bytes) -> int:
+        """Append."""
         self._buffer += data
         return len(data)
 
     def tell(self) -> int:
+        """Return where the next byte will be in the file."""
         return self._start + len(self._buffer)
 
     def patch(self, place: int, data: bytes) -> None:
