@@ -11,7 +11,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -33,26 +32,26 @@ REPEAT = 9
 NEWS_S = 5.0
 """Time between lines on progress when there is no terminal, s."""
 
-_D = {field.name: field.default for field in fields(Excitation)}
+_DEFAULT = Excitation()
 SETTINGS = {
-    "kind": Setting(_D["kind"], "the signal", choices=tuple(KINDS)),
-    "duration": Setting(_D["duration"], "length of the signal", "s", 0.01, 3600.0),
-    "seed": Setting(_D["seed"], "the same seed gives the same signal", low=0, high=2**31 - 1),
-    "duty_min": Setting(_D["duty_min"], "least duty of latin_hypercube, staircase, multisine", low=0.0, high=1.0),
-    "duty_max": Setting(_D["duty_max"], "greatest duty of the same", low=0.0, high=1.0),
-    "hold_min": Setting(_D["hold_min"], "shortest hold of latin_hypercube", "s", SAMPLE_PERIOD, 600.0),
+    "kind": Setting(_DEFAULT.kind, "the signal", choices=tuple(KINDS)),
+    "duration": Setting(_DEFAULT.duration, "length of the signal", "s", 0.01, 3600.0),
+    "seed": Setting(_DEFAULT.seed, "the same seed gives the same signal", low=0, high=2**31 - 1),
+    "duty_min": Setting(_DEFAULT.duty_min, "least duty of latin_hypercube, staircase, multisine", low=0.0, high=1.0),
+    "duty_max": Setting(_DEFAULT.duty_max, "greatest duty of the same", low=0.0, high=1.0),
+    "hold_min": Setting(_DEFAULT.hold_min, "shortest hold of latin_hypercube", "s", SAMPLE_PERIOD, 600.0),
     "hold_max": Setting(
-        _D["hold_max"],
+        _DEFAULT.hold_max,
         "longest hold of latin_hypercube; each hold of steps; lift of free_decay",
         "s",
         SAMPLE_PERIOD,
         600.0,
     ),
-    "levels": Setting(_D["levels"], "intervals of latin_hypercube, stairs of staircase", low=2, high=1000),
-    "rest": Setting(_D["rest"], "duty 0 after each hypercube, and after each lift of free_decay", "s", 0.0, 600.0),
-    "duty": Setting(_D["duty"], "duty of hold and free_decay", low=0.0, high=1.0),
-    "sequence": Setting(list(_D["sequence"]), "duties of steps, repeated", low=0.0, high=1.0),
-    "frequencies": Setting(list(_D["frequencies"]), "of multisine", "Hz", 1e-4, 0.5 / SAMPLE_PERIOD),
+    "levels": Setting(_DEFAULT.levels, "intervals of latin_hypercube, stairs of staircase", low=2, high=1000),
+    "rest": Setting(_DEFAULT.rest, "duty 0 after each hypercube, and after each lift of free_decay", "s", 0.0, 600.0),
+    "duty": Setting(_DEFAULT.duty, "duty of hold and free_decay", low=0.0, high=1.0),
+    "sequence": Setting(list(_DEFAULT.sequence), "duties of steps, repeated", low=0.0, high=1.0),
+    "frequencies": Setting(list(_DEFAULT.frequencies), "of multisine", "Hz", 1e-4, 0.5 / SAMPLE_PERIOD),
 }
 
 USAGE = usage(
@@ -87,10 +86,11 @@ class Excite(Node):
     def __init__(self) -> None:
         super().__init__("excite", automatically_declare_parameters_from_overrides=True)
         settings = read_settings(self, SETTINGS, overrides(self))
+        values: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()
+        }
         try:
-            self._excitation = Excitation(
-                **{name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
-            )
+            self._excitation = Excitation(**values)
         except ValueError as error:
             raise UserError(str(error)) from error
         self._series = self._excitation.series()

@@ -9,8 +9,8 @@ stays equal to ROS time, and they count as lost, as on a real rig nobody listene
 grid moves by whole periods and a warning says so.
 
 Faster than real time (`speed` not 1), stamps are simulated time, which starts one period after 0, and `/clock` carries
-it before each sample. No sample is left out: simulated time runs slower than asked instead. Nothing waits for listeners,
-though: one that is too slow for the speed loses samples, and the stamps show it.
+it before each sample. No sample is left out: simulated time runs slower than asked instead. Nothing waits for
+listeners, though: one that is too slow for the speed loses samples, and the stamps show it.
 
 Every parameter is read at start and fixed while the node runs: a recording belongs to one model.
 """
