@@ -6,8 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from aeropend_sim.parameters import SAMPLE_PERIOD
 from numpy.typing import NDArray
+
+from aeropend_sim.parameters import SAMPLE_PERIOD
 
 Array = NDArray[np.float64]
 

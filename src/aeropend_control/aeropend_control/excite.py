@@ -14,8 +14,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from aeropend_sim.parameters import SAMPLE_PERIOD
-from aeropend_sim.ros import Diagnostics, Setting, UserError, Worker, overrides, read_settings, run, usage
 from rclpy.clock import JumpThreshold
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -25,6 +23,8 @@ from std_msgs.msg import Float64
 
 from aeropend_control.excitation import KINDS, Excitation
 from aeropend_sim import interface
+from aeropend_sim.parameters import SAMPLE_PERIOD
+from aeropend_sim.ros import Diagnostics, Setting, UserError, Worker, overrides, read_settings, run, usage
 
 PERIOD_NS = round(SAMPLE_PERIOD * 1e9)
 REPEAT = 9

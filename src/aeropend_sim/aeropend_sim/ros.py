@@ -93,7 +93,7 @@ class Worker(threading.Thread):
         try:
             self._body(self._end)
             self._node.done = True
-        except Exception as error:  # noqa: BLE001 - the main thread raises it
+        except Exception as error:  # the main thread raises it
             self._node.error = error
 
     def stop(self) -> None:
