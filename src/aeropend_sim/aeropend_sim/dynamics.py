@@ -487,7 +487,10 @@ def steps_in(model: Model, period: float) -> int:
              math.sqrt(n["mgd_over_J"]) / 0.3, n["c_over_J"] / 0.3]
     if e is not None:
         free = 1.0 - e.mast_flex_coupling
-        damping = n["c_over_J"] + n["L_over_J"] * e.axial_inflow_k * top_speed
+        top_thrust = n["k_thrust"] * THRUST_PIVOT_SPEED**2 * (top_speed / THRUST_PIVOT_SPEED)**e.thrust_exponent_n
+        top_drive = n["mgd_over_J"] + n["L_over_J"] * top_thrust * (1.0 + max(0.0, e.ground_effect_gain))
+        damping = (n["c_over_J"] + n["L_over_J"] * e.axial_inflow_k * top_speed
+                   + 2.0 * math.sqrt(e.quadratic_drag_k * (top_drive + 4.0 * e.gust_sigma)))  # at terminal speed
         rates += [math.sqrt((n["mgd_over_J"] + abs(e.cable_torque_k)) / free) / 0.3, damping / free / 0.3]
         if e.mast_flex_coupling > 0.0:
             rates += [e.mast_flex_omega / math.sqrt(free) / 0.3,
@@ -515,7 +518,10 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0
 
 
 class Trajectory(NamedTuple):
-    """States at the samples, each (N,), SI; `v_a` is the voltage at the motor's terminals as the hold begins."""
+    """States at the samples, each (N,), SI; `v_a` is the voltage at the motor's terminals as the hold begins.
+
+    `thrust` is the air's, before `ground_effect` and `axial_inflow`.
+    """
 
     theta: Array
     theta_dot: Array

@@ -82,7 +82,7 @@ _ENTRIES = (
     Effect("quadratic_drag", "arm", "air drag of the arm: - k θ̇|θ̇|",
            {"k": P("1/rad", 0.0, 0.6, 0.0, 20.0, "drag over the arm's inertia")}),
     Effect("cable_torque", "arm", "the cable is a spring: - k (θ - theta0)",
-           {"k": P("1/s²", 0.0, 4.0, -20.0, 60.0, "stiffness over the arm's inertia"),
+           {"k": P("1/s²", 0.0, 4.0, 0.0, 60.0, "stiffness over the arm's inertia"),
             "theta0": P("rad", 0.0, 0.4, -2.0, 2.0, "angle at which the cable is slack")}),
     Effect("mast_flex", "arm", "the mast swings: q̈ + 2 zeta omega q̇ + omega² q = -coupling θ̈, acting back with -q̈",
            {"coupling": P("-", 0.0, 0.3, 0.0, 0.9, "share of the arm's inertia that the mode moves"),

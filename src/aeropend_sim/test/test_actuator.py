@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aeropend_sim import actuator
+from aeropend_sim.parameters import PRESETS, SAMPLE_PERIOD, load
+
+BENCH, THESIS = (load(preset).model for preset in ("bench", "thesis"))
+presets = st.sampled_from([BENCH, THESIS])
+speeds = st.floats(-400.0, 400.0)
+
+
+def first_duty(numbers):
+    """Below it the map gives no voltage."""
+    return ((numbers["k0"] / numbers["k1"])**2 - numbers["k3"]) / numbers["k2"]
+
+
+@given(numbers=presets, duty=st.floats(0.0, 1.0))
+def test_duty_is_the_inverse_of_voltage(numbers, duty):
+    v = float(actuator.voltage(numbers, duty))
+    back = float(actuator.duty(numbers, v))
+    if v > 0.0:
+        assert back == pytest.approx(duty, abs=1e-12)
+    else:
+        assert back == 0.0
+        assert duty <= first_duty(numbers) + 1e-15
+
+
+@given(numbers=presets, share=st.floats(1e-6, 1.0))
+def test_voltage_is_the_inverse_of_duty(numbers, share):
+    v = share * float(actuator.voltage(numbers, 1.0))
+    assert float(actuator.voltage(numbers, actuator.duty(numbers, v))) == pytest.approx(v, rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_dead_zone_and_limits(preset):
+    numbers = load(preset).model
+    edge = first_duty(numbers)
+    assert 0.005 < edge < 0.02
+    assert actuator.voltage(numbers, [0.0, 0.5 * edge, edge * (1.0 - 1e-9)]).tolist() == [0.0, 0.0, 0.0]
+    assert actuator.voltage(numbers, edge * (1.0 + 1e-6)) > 0.0
+    assert actuator.duty(numbers, [-1.0, 0.0]).tolist() == [0.0, 0.0]
+    assert actuator.duty(numbers, 1e-9) == pytest.approx(edge, rel=1e-6)
+    assert actuator.duty(numbers, 99.0) == 1.0
+
+
+@given(numbers=presets, speed=speeds)
+def test_speed_is_the_inverse_of_thrust(numbers, speed):
+    f = actuator.thrust(numbers, speed)
+    assert np.sign(f) == np.sign(speed) or f == 0.0
+    assert float(actuator.speed(numbers, f)) == pytest.approx(speed, rel=1e-12, abs=1e-120)
+
+
+@given(numbers=presets, speed=st.floats(0.0, 400.0))
+def test_speed_at_is_the_inverse_of_voltage_at(numbers, speed):
+    v = actuator.voltage_at(numbers, speed)
+    assert float(actuator.speed_at(numbers, v)) == pytest.approx(speed, rel=1e-12, abs=1e-300)
+
+
+@given(numbers=presets, speed=speeds)
+def test_current_at_balances_the_torques(numbers, speed):
+    i = float(actuator.current_at(numbers, speed))
+    load_torque = numbers["B_m"] * speed + numbers["k_load"] * speed * abs(speed)
+    assert numbers["K_t"] * i == pytest.approx(load_torque, rel=1e-12, abs=1e-300)
+
+
+@given(numbers=presets, duty=st.floats(0.0, 1.0))
+def test_static_angle_balances_the_weight(numbers, duty):
+    angle = float(actuator.static_angle(numbers, duty))
+    f = float(actuator.thrust(numbers, actuator.speed_at(numbers, actuator.voltage(numbers, duty))))
+    lift = numbers["L_over_J"] * f
+    if lift > numbers["mgd_over_J"]:
+        assert math.isnan(angle)
+    else:
+        assert numbers["mgd_over_J"] * math.sin(angle) == pytest.approx(lift, rel=1e-9, abs=1e-12)
+
+
+def test_bench_can_lift_the_arm_over_the_top_and_thesis_cannot():
+    assert np.isnan(actuator.static_angle(BENCH, 1.0))
+    assert actuator.static_angle(THESIS, 1.0) < 1.6
+
+
+def test_scalars_and_arrays_alike():
+    a = actuator
+    for function, value in ((a.voltage, 0.3), (a.duty, 1.1), (a.thrust, 99.0), (a.speed, 0.1), (a.current_at, 99.0),
+                            (a.voltage_at, 99.0), (a.speed_at, 1.1), (a.static_angle, 0.3)):
+        one = function(BENCH, value)
+        many = function(BENCH, np.full((2, 3), value))
+        assert np.shape(one) == ()
+        assert many.shape == (2, 3)
+        assert (many == one).all()
+
+
+DUTY = np.concatenate([np.full(50, 0.1), np.full(50, 0.8), np.full(50, 0.02), np.full(50, 0.5)])
+
+
+def acting(effects, **options):
+    return actuator.acting_voltage(BENCH, DUTY, effects, SAMPLE_PERIOD, **options)
+
+
+def test_no_effect_is_the_map():
+    assert np.array_equal(acting({}), actuator.voltage(BENCH, DUTY))
+
+
+def test_bridge_drop_never_turns_the_voltage():
+    v = acting({"bridge_drop": {"v_drop": 0.2}})
+    assert v == pytest.approx(np.maximum(0.0, actuator.voltage(BENCH, DUTY) - 0.2))
+    assert v.min() == 0.0
+
+
+def test_supply_drift_counts_from_the_start():
+    v = acting({"supply_drift": {"rate": 0.01}}, start=1000)
+    time = (1000 + np.arange(len(DUTY))) * SAMPLE_PERIOD
+    assert v == pytest.approx(actuator.voltage(BENCH, DUTY) * (1.0 - 0.01 * time))
+
+
+def test_supply_drift_ends_at_an_empty_battery():
+    assert not acting({"supply_drift": {"rate": 0.02}}, start=100_000).any()
+
+
+@given(delay=st.floats(0.0, 0.5))
+def test_delay_keeps_the_volt_seconds_of_each_step(delay):
+    """What comes after n holds is what the map gives until `delay` before, as if switched within a hold."""
+    v = actuator.voltage(BENCH, DUTY)
+    late = acting({"command_delay": {"delay": delay}})
+    edges = np.arange(len(DUTY) + 1) * SAMPLE_PERIOD
+    sums = np.concatenate([[0.0], np.cumsum(v) * SAMPLE_PERIOD])
+    assert np.cumsum(late) * SAMPLE_PERIOD == pytest.approx(np.interp(edges[1:] - delay, edges, sums), abs=1e-12)
+
+
+def test_delay_of_whole_periods_shifts():
+    late = acting({"command_delay": {"delay": 7.0 * SAMPLE_PERIOD}})
+    assert late[7:] == pytest.approx(actuator.voltage(BENCH, DUTY)[:-7], abs=1e-12)
+    assert not late[:7].any()
+
+
+def test_before_is_what_acts_until_the_first_duty_comes():
+    late = acting({"command_delay": {"delay": 7.0 * SAMPLE_PERIOD}, "bridge_drop": {"v_drop": 0.2}}, before=0.6)
+    assert late[:6] == pytest.approx(np.full(6, float(actuator.voltage(BENCH, 0.6)) - 0.2))
+
+
+def test_order_of_the_actuators_effects():
+    """The duty comes late; it meets the battery as it is by then; the bridge takes its drop of what comes."""
+    effects = {"command_delay": {"delay": 20.0 * SAMPLE_PERIOD}, "supply_drift": {"rate": 0.02},
+               "bridge_drop": {"v_drop": 0.2}}
+    k = np.arange(20, len(DUTY))
+    expected = actuator.voltage(BENCH, DUTY[k - 20]) * (1.0 - 0.02 * k * SAMPLE_PERIOD) - 0.2
+    assert acting(effects)[k] == pytest.approx(np.maximum(0.0, expected), abs=1e-12)
+
+
+@pytest.mark.parametrize("neutral", [{"bridge_drop": {"v_drop": 0.0}}, {"supply_drift": {"rate": 0.0}},
+                                     {"command_delay": {"delay": 0.0}}])
+def test_effects_of_no_size_change_no_bit(neutral):
+    others = {"bridge_drop": {"v_drop": 0.1}, "supply_drift": {"rate": 0.01}, "command_delay": {"delay": 0.0123}}
+    assert np.array_equal(acting(neutral), acting({}))
+    rest = {id_: p for id_, p in others.items() if id_ not in neutral}
+    assert np.array_equal(acting({**rest, **neutral}), acting(rest))
