@@ -82,13 +82,17 @@ class Chain:
 
     def actuator_residuals(self, values: Values) -> dict[str, Array]:
         """Residual of the voltage over the training part, in units of its noise."""
-        return {"v_a": self._train(self.signals.v_a - self.actuator(values)) / self.signals.sigma["v_a"]}
+        s = self.signals
+        return {"v_a": self._train(s.v_a - self.actuator(values), s.after_unseen) / s.sigma["v_a"]}
 
     def feed_motor(self, values: Values) -> None:
         """Take the voltage that feeds the motor from the measured one, described by the actuator with these values."""
+        s = self.signals
         v = self.actuator(values)
-        if self.signals.has("v_a"):
-            v = v + smooth(self.signals.v_a - v, round(0.05 / self.signals.period))
+        if s.has("v_a"):
+            v = v + smooth(s.v_a - v, round(0.05 / s.period))
+            early = np.arange(len(s)) < s.after_unseen
+            v = np.where(early & np.isfinite(s.v_a), s.v_a, v)
         self.voltage = v
 
     # --- motor: voltage -> current, speed
@@ -158,8 +162,8 @@ class Chain:
         """The residual function of a block by name."""
         return {"actuator": self.actuator_residuals, "motor": self.motor_residuals, "arm": self.arm_residuals}[block]
 
-    def _train(self, x: Array) -> Array:
-        x = x[: self.signals.train]
+    def _train(self, x: Array, start: int = 0) -> Array:
+        x = x[start:self.signals.train]
         return x[np.isfinite(x)]
 
 

@@ -94,25 +94,22 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
     share, low, high = shrink.closed(gap_before, gap_after, floors)
 
     groups = [(h.place, {u.name: _neutral(model, u.name) for u in h.starts[0]}) for h in found]
-    for place in dict.fromkeys(PLACE_OF_NUMBER.values()):
-        back = {n: model.model[n] for n in values if PLACE_OF_NUMBER.get(n) == place
-                and n not in {h.number for h in found}}
-        if back:
-            groups.append((place, back))
-    ablated = {h.name: max(scorer.squared({**values, **dict(back)}) - scorer.squared(values), 0.0)
-               for h, (_, back) in zip(found, groups, strict=False)}
+    best = scorer.squared(values)
+    ablated = {h.name: max(scorer.squared({**values, **back}) - best, 0.0)
+               for h, (_, back) in zip(found, groups, strict=True)}
     unexplained = _unexplained(findings, scorer, gap_after, floors)
-    excused = set()
     if torque is not None:
         ablated["gust"] = unexplained.pop("arm", 0.0)
-        groups.append(("arm", {}))
-        excused.add("gust")
     if spikes is not None:
-        ablated["speed_spikes"] = max(gap_before.rms["omega"] ** 2 - gap_after.rms["omega"] ** 2, 0.0)
-    parts = where.shares(scorer.squared, values, groups, unexplained)
-    for name in ("gust", "speed_spikes"):
-        if name in ablated:
-            parts = _add_share(parts, CATALOGUE[name].place, ablated[name], scorer.squared(values))
+        false = gap_before.rms["omega"] ** 2 - scorer.gap(before).rms["omega"] ** 2
+        ablated["speed_spikes"] = max(false, 0.0) / gap_before.spread["omega"] ** 2 / len(gap_before.rms)
+    amounts = [*((h.place, ablated[h.name]) for h in found), *unexplained.items(),
+               *((CATALOGUE[name].place, ablated[name]) for name in ("gust", "speed_spikes") if name in ablated)]
+    if not amounts:  # nothing but numbers within their uncertainty: how the gap that they leave is shared
+        for place in dict.fromkeys(PLACE_OF_NUMBER.values()):
+            back = {n: model.model[n] for n in values if PLACE_OF_NUMBER.get(n) == place}
+            amounts.append((place, max(scorer.squared({**values, **back}) - best, 0.0)))
+    parts = where.shares(amounts)
 
     candidates = _candidates(findings, values, sd, torque, spikes, scorer, gap_after.total)
     order = sorted(ablated, key=lambda name: -ablated[name])
@@ -293,11 +290,6 @@ def _unexplained(findings: Mapping[str, Findings], scorer: _Scorer, after: shrin
     return left
 
 
-def _add_share(parts: dict[str, float], place: str, amount: float, _: float) -> dict[str, float]:
-    total = sum(parts.values()) + amount
-    return {p: (x + (amount if p == place else 0.0)) / total if total > 0.0 else 0.0 for p, x in parts.items()}
-
-
 def _joint(chains: Chains, findings: Mapping[str, Findings]) -> tuple[dict[str, float], dict[str, float]]:
     """Fit everything found and every number together, on the whole chain from the duty to all channels."""
     unknowns: dict[str, Unknown] = {}
@@ -316,7 +308,7 @@ def _joint(chains: Chains, findings: Mapping[str, Findings]) -> tuple[dict[str, 
             readings = shrink.free_run(chains.model, s, chains.own(values, k))
             suffix = f"@{k}" if k else ""
             for channel in ("theta", "i_a", "v_a"):
-                e = (s.channel(channel) - readings[channel])[: s.train]
+                e = (s.channel(channel) - readings[channel])[s.after_unseen if channel == "v_a" else 0:s.train]
                 out[channel + suffix] = e[np.isfinite(e)] / s.sigma[channel]
             p = s.pulses
             if p is not None:

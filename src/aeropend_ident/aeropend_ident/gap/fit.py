@@ -180,9 +180,9 @@ def fit(residuals: Callable[[dict[str, float]], Residuals], unknowns: Sequence[U
     information = np.eye(len(search.z))
     for _ in range(rounds):
         information = search.improve(steps)
-        before = search.scale
+        before = search.weight
         search.renew_weights()
-        if all(abs(search.scale[k] - before[k]) < 0.01 * before[k] for k in before):
+        if all(abs(search.weight[k] - before[k]) < 0.02 * before[k] for k in before):
             break
     z, covariance = search.z, np.linalg.inv(information)
     prior = -0.5 * float(z @ z) - 0.5 * float(np.linalg.slogdet(information)[1])

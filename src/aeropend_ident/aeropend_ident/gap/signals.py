@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from aeropend_sim.effects import CATALOGUE
+from aeropend_sim.sensing import SPEED_TIMEOUT
 from numpy.typing import NDArray
 
 from aeropend_ident.recording import Recording, RecordingError
@@ -19,6 +21,10 @@ CHANNELS = {"theta": "rad", "omega": "rad/s", "i_a": "A", "v_a": "V"}
 
 MINIMUM_DURATION = 5.0
 """s of data below which nothing is said."""
+
+
+PEAK = 1.25
+"""A rotor is too heavy for one interval to be this much faster than both of its neighbours."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +75,11 @@ class Signals:
 
     def __len__(self) -> int:
         return len(self.duty)
+
+    @property
+    def after_unseen(self) -> int:
+        """First sample whose voltage no duty from before the recording can have set, however late it acts."""
+        return math.ceil(CATALOGUE["command_delay"].parameters["delay"].high / self.period) + 1
 
     def channel(self, name: str) -> Array:
         """A measured channel by name, (N,)."""
@@ -153,14 +164,17 @@ def find_pulses(omega: Array, period: float, sensing: Mapping[str, float]) -> Pu
     speed = held[at]
     length = turn / speed if len(at) else np.zeros(0)
     elapsed = np.diff(at, prepend=-(10**9)) * period
-    slack = 1.01 * period + 2.0 * sensing["speed_tick"]
-    before = np.concatenate([[1e9], length[:-1]])
-    # a period repeated to the tick does not show: whole multiples of the one before may have passed unseen
-    silent = np.maximum(np.rint((elapsed - length) / before), 0.0)
-    false = np.abs(elapsed - length - silent * before) > slack
-    if len(at):
-        false[0] = False
-    false &= elapsed < 0.5
+    stopped = np.zeros(len(at), dtype=bool)  # the speed read 0 before this interval showed
+    stopped[1:] = np.minimum.reduceat(held, at)[:-1] == 0.0 if len(at) else []
+    false = np.zeros(len(at), dtype=bool)
+    for j in range(1, len(at)):
+        rest = elapsed[j] - length[j]
+        if not false[j - 1]:
+            # a period repeated to the tick does not show: whole multiples of the one before may have passed unseen
+            rest -= max(round(rest / length[j - 1]), 0) * length[j - 1]
+        starts_anew = stopped[j] and length[j] < SPEED_TIMEOUT
+        alone = j + 1 < len(at) and speed[j] > PEAK * max(speed[j - 1], speed[j + 1])
+        false[j] = alone or abs(rest) > 1.01 * period + 2.0 * sensing["speed_tick"] and not starts_anew
     time = (at - 0.5) * period
     slope = np.gradient(speed, time) if len(at) > 2 else np.zeros(len(at))
     tick = np.maximum(sensing["speed_tick"], 1e-6) * speed / np.maximum(length, 1e-9) if len(at) else np.zeros(0)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from aeropend_sim.effects import PLACES
@@ -16,22 +16,11 @@ NOTEWORTHY = 0.15
 """A region is named when its share of the misfit exceeds its share of the time by this much."""
 
 
-def shares(squared_gap: Callable[[Mapping[str, float]], float], values: Mapping[str, float],
-           groups: Iterable[tuple[str, Mapping[str, float]]], unexplained: Mapping[str, float]) -> dict[str, float]:
-    """Share of each place: how much of the gap comes back when what was found there is taken out again.
-
-    Args:
-        squared_gap: values -> squared gap of the augmented model with these values.
-        values: everything found.
-        groups: (place, the values that take one finding back to nominal), several for a place allowed.
-        unexplained: place -> squared gap that nothing found explains.
-    """
+def shares(amounts: Iterable[tuple[str, float]]) -> dict[str, float]:
+    """Share of each place, from amounts of squared gap by place: what comes back when a finding is taken out again."""
     total = dict.fromkeys(PLACES, 0.0)
-    best = squared_gap(values)
-    for place, reverted in groups:
-        total[place] += max(squared_gap({**values, **reverted}) - best, 0.0)
-    for place, amount in unexplained.items():
-        total[place] += max(amount, 0.0)
+    for place, amount in amounts:
+        total[place] += amount
     everything = sum(total.values())
     return {place: (x / everything if everything > 0.0 else 0.0) for place, x in total.items()}
 

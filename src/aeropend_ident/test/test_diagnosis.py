@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Known truth in, the same truth out: every effect of the catalogue at its default size, in rigs whose numbers are off."""
+
+import json
+
+import numpy as np
+import pytest
+from aeropend_sim import rig
+from aeropend_sim.effects import CATALOGUE
+from aeropend_sim.parameters import SAMPLE_PERIOD, Model
+from rigs import BENCH, drawn_rig, recorded, steps
+
+from aeropend_ident.gap.diagnosis import diagnose
+from aeropend_ident.gap.signals import from_arrays
+
+RANDOM = {"gust", "speed_spikes"}
+
+
+def candidate(body, effect):
+    return next(c for c in body["which"]["candidates"] if c["effect"] == effect)
+
+
+@pytest.mark.parametrize("effect", CATALOGUE)
+def test_each_effect_is_named_placed_and_measured(effect):
+    body = diagnose(BENCH, [recorded(list(CATALOGUE).index(effect) + 50, {effect: {}})], 2).body
+    assert body["which"]["verdict"] == effect
+    assert body["where"]["place"] == CATALOGUE[effect].place
+    size = candidate(body, effect)["parameters"][CATALOGUE[effect].size]
+    true = CATALOGUE[effect].parameters[CATALOGUE[effect].size].default
+    assert abs(size["value"] - true) < 2.0 * (size["high"] - size["low"]) + 0.02 * abs(true)
+    if effect not in RANDOM:
+        assert body["shrink"]["closed"] > 0.9
+        for channel in body["channels"].values():
+            assert channel["gap_after"] < 2.0 * channel["floor"]
+    json.dumps(body, allow_nan=False)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_rig_whose_numbers_are_merely_a_little_off_has_no_effect(seed):
+    body = diagnose(BENCH, [recorded(seed)], 2).body
+    assert (body["which"]["verdict"], body["which"]["effects"]) == ("none", [])
+    assert body["shrink"]["gap_after"] < 1.2 * body["shrink"]["floor"]
+
+
+def test_two_effects_in_different_places_are_both_found():
+    body = diagnose(BENCH, [recorded(71, {"coulomb_friction": {}, "brush_drop": {}})], 2).body
+    assert set(body["which"]["effects"]) == {"coulomb_friction", "brush_drop"}
+
+
+def test_two_effects_in_one_place_are_both_found():
+    body = diagnose(BENCH, [recorded(72, {"coulomb_friction": {}, "thrust_lag": {}})], 2).body
+    assert set(body["which"]["effects"]) == {"coulomb_friction", "thrust_lag"}
+
+
+@pytest.mark.parametrize("number", ["R_a", "mgd_over_J", "J_m"])
+def test_a_number_that_is_far_off_is_named(number):
+    model = drawn_rig(80, {})
+    model = Model("rig", {**model.model, number: 1.4 * BENCH.model[number]}, model.sensing)
+    duty = steps(40.0, 80)
+    columns, _ = rig.record(model, duty, 80)
+    body = diagnose(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)], 2).body
+    assert body["which"]["verdict"] == "parameter_mismatch"
+    found = candidate(body, "parameter_mismatch")["parameters"]
+    assert list(found) == [number]
+    assert found[number]["value"] == pytest.approx(1.4 * BENCH.model[number], rel=0.06)
+
+
+def test_what_the_catalogue_does_not_hold_is_unknown():
+    """The angle reading jumps by 0.08 rad now and then: a slipping coupling."""
+    duty = steps(40.0, 90)
+    columns, _ = rig.record(drawn_rig(90, {}), duty, 90)
+    jumps = np.cumsum(np.random.default_rng(1).choice([0.0, 0.08, -0.08], len(duty), p=[0.999, 0.0005, 0.0005]))
+    columns["theta"] = columns["theta"] + jumps
+    body = diagnose(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)], 2).body
+    assert body["which"]["verdict"] in {"unknown", "gust"}
+    assert body["shrink"]["closed"] < 0.8
+
+
+@pytest.mark.parametrize("without", [("omega",), ("i_a", "v_a"), ("omega", "i_a", "v_a")])
+def test_missing_channels_leave_a_verdict_on_the_arm(without):
+    body = diagnose(BENCH, [recorded(95, {"coulomb_friction": {"accel": 1.5}}, off=0.005, without=without)], 2).body
+    assert set(body["channels"]) == {"theta", "omega", "i_a", "v_a"} - set(without)
+    assert "coulomb_friction" in body["which"]["effects"]
+
+
+def test_several_recordings_of_one_rig_are_fitted_together():
+    effects = {"coulomb_friction": {}}
+    model = drawn_rig(97, effects)
+    signals = []
+    for seed in (97, 98):
+        duty = steps(25.0, seed)
+        columns, _ = rig.record(model, duty, seed)
+        signals.append(from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing))
+    both = diagnose(BENCH, signals, 2).body
+    one = diagnose(BENCH, signals[:1], 2).body
+    assert both["which"]["effects"] == ["coulomb_friction"]
+    width = [candidate(b, "coulomb_friction")["parameters"]["accel"] for b in (both, one)]
+    assert width[0]["high"] - width[0]["low"] < width[1]["high"] - width[1]["low"]
+
+
+def test_the_verdict_does_not_depend_on_the_number_of_threads():
+    signals = recorded(3, {"quadratic_drag": {}}, duration=20.0)
+    assert diagnose(BENCH, [signals], 1).body == diagnose(BENCH, [signals], 2).body
+
+
+def test_the_augmented_model_runs_the_rig():
+    signals = recorded(4, {"thrust_lag": {}})
+    result = diagnose(BENCH, [signals], 2)
+    columns, _ = rig.record(result.augmented, signals.duty, 1)
+    assert np.sqrt(np.mean((columns["theta"] - signals.theta) ** 2)) < 2.0 * signals.sigma["theta"]

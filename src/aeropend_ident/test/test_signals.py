@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from aeropend_sim import rig
+from aeropend_sim.parameters import SAMPLE_PERIOD
+from rigs import BENCH, drawn_rig, recorded, steps
+
+from aeropend_ident.gap.signals import find_pulses, from_arrays
+from aeropend_ident.recording import RecordingError
+
+
+def columns(duration=6.0, **replaced):
+    duty = steps(duration, 3)
+    read, _ = rig.record(BENCH, duty, 3)
+    return {**read, "duty": duty, **replaced}
+
+
+def test_pulses_are_where_the_rotor_completed_a_turn():
+    duty = steps(20.0, 1)
+    read, truth = rig.record(BENCH, duty, 1)
+    pulses = find_pulses(read["omega"], SAMPLE_PERIOD, BENCH.sensing)
+    turns = np.floor(truth["rotor_angle"] / (2 * np.pi))
+    completed = np.flatnonzero(np.diff(turns) > 0) + 1
+    assert len(pulses.index) > 100
+    assert np.isin(pulses.index, completed).all()
+    assert not pulses.false.any()
+    grid = np.arange(len(duty)) * SAMPLE_PERIOD
+    mean = (np.interp(pulses.time, grid, truth["rotor_angle"])
+            - np.interp(pulses.time - pulses.period, grid, truth["rotor_angle"])) / pulses.period
+    assert np.sqrt(np.mean(((mean - pulses.omega) / pulses.sigma) ** 2)) < 1.5
+
+
+def test_false_periods_are_told_from_true_ones():
+    model = drawn_rig(5, {"speed_spikes": {"rate": 3.0}})
+    duty = steps(40.0, 5)
+    read, _ = rig.record(model, duty, 5)
+    clean, _ = rig.record(model.with_effects({}), duty, 5)
+    pulses = find_pulses(read["omega"], SAMPLE_PERIOD, BENCH.sensing)
+    truly = np.abs(read["omega"] - clean["omega"])[pulses.index] > 0.0
+    assert truly.sum() > 40
+    assert (pulses.false & truly).sum() > 0.95 * truly.sum()
+    assert (pulses.false & ~truly).sum() < 0.02 * len(truly)
+
+
+def test_a_missing_sample_keeps_its_place():
+    data = columns()
+    for name in data:
+        data[name][100:103] = np.nan
+    signals = from_arrays(data, SAMPLE_PERIOD, BENCH.sensing)
+    assert np.isnan(signals.theta[100:103]).all()
+    np.testing.assert_array_equal(signals.duty[100:103], signals.duty[99])
+    assert signals.train == round(0.7 * len(signals))
+
+
+@pytest.mark.parametrize(("replaced", "word"), [
+    ({"theta": np.full(2941, np.nan)}, "no arm angle"), ({"duty": np.full(2941, np.nan)}, "no duty")])
+def test_what_cannot_be_compared_is_said(replaced, word):
+    with pytest.raises(RecordingError, match=word) as raised:
+        from_arrays(columns(**replaced), SAMPLE_PERIOD, BENCH.sensing, name="my_bag")
+    assert str(raised.value).startswith("my_bag: ")
+    assert "\n" not in str(raised.value)
+
+
+def test_too_short_is_said():
+    short = {name: x[:1000] for name, x in columns().items()}
+    with pytest.raises(RecordingError, match=r"2\.0 s of samples"):
+        from_arrays(short, SAMPLE_PERIOD, BENCH.sensing)
+
+
+def test_noise_larger_than_the_model_says_is_seen():
+    data = columns()
+    data["i_a"] = data["i_a"] + 0.05 * np.random.default_rng(0).standard_normal(len(data["i_a"]))
+    assert from_arrays(data, SAMPLE_PERIOD, BENCH.sensing).sigma["i_a"] == pytest.approx(0.05, rel=0.1)
+    assert recorded(0, duration=6.0).sigma["i_a"] == pytest.approx(0.005, rel=0.01)
