@@ -6,7 +6,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -72,8 +72,10 @@ class Content:
         return Content([one for one in self.messages if one[0] not in topics], self.arrays)
 
 
-def content(count: int = 50, namespace: str = "", seed: int = 0) -> Content:
-    """Make up samples of a rig with two commands and one reference among them."""
+def content(
+    count: int = 50, namespace: str = "", seed: int = 0, columns: Mapping[str, np.ndarray] | None = None
+) -> Content:
+    """Make up samples of a rig, or take columns as given, with two commands and one reference among them."""
     rng = np.random.default_rng(seed)
     stamps = START_NS + PERIOD_NS * np.arange(count)
     arrays = {
@@ -83,6 +85,7 @@ def content(count: int = 50, namespace: str = "", seed: int = 0) -> Content:
         "v_a": rng.normal(size=count).astype(np.float32).astype(float),
         "i_a": rng.normal(size=count).astype(np.float32).astype(float),
         "duty": rng.random(count).astype(np.float32).astype(float),
+        **(columns or {}),
     }
     messages = []
     for row, stamp in enumerate(stamps.tolist()):
