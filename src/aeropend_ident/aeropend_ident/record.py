@@ -107,7 +107,8 @@ class Tap:
         self.heard = time.monotonic()
         self.silent = False
         self.publishers = 0
-        self._number: int | None = None
+        self._number: int | None = None  # of the last message, by its publisher's count
+        self._skipped = 0
 
     def take(self) -> tuple[int, bytes] | None:
         """Take the next message: receive time (ns) and what was on the wire. None when there is none."""
@@ -118,10 +119,19 @@ class Tap:
             return None
         message, info = taken
         number = info["publication_sequence_number"]
-        if self.publishers == 1 and self._number is not None and number is not None and number > self._number + 1:
-            self.lost += number - self._number - 1
-        self._number = number if self.publishers == 1 else None
+        if self._number is not None and number is not None and number > self._number + 1:
+            self._skipped += number - self._number - 1
+        self._number = number
         return info["received_timestamp"] or time.time_ns(), message
+
+    def count_publishers(self, publishers: int) -> None:
+        """Note how many publishers there are. Only one publisher's numbers, all the while, tell what was lost."""
+        if self.publishers == 1 and publishers <= 1:
+            self.lost += self._skipped
+        else:
+            self._number = None
+        self._skipped = 0
+        self.publishers = publishers
 
 
 class Record(Node):
@@ -207,6 +217,8 @@ class Record(Node):
                     stored = sum(self._writer.counts.values())
                     checkpoint = now + CHECKPOINT_S
                 self._display.update(now)
+            for tap in self._taps.values():
+                tap.count_publishers(tap.publishers)
             self._writer.close()
         except (OSError, sqlite3.Error, WriterError) as error:
             raise self._failure(error, stored) from error
@@ -275,7 +287,7 @@ class Record(Node):
                 return
             self._taps[topic] = tap
         publishers = self.get_publishers_info_by_topic(topic)
-        tap.publishers = len(publishers)
+        tap.count_publishers(len(publishers))
         qos = _qos_for([info.qos_profile for info in publishers])
         if tap.subscription is None or (tap.publishers and qos != tap.qos):
             if tap.subscription is not None:

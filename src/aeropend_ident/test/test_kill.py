@@ -155,15 +155,25 @@ def test_disk_full_from_the_start_leaves_nothing(processes):
     assert not path.exists()
 
 
-def test_a_pause_loses_nothing(processes, plant):
-    """A recorder stopped for a while (SIGSTOP) catches up: nothing is lost that the middleware could hold."""
+@pytest.mark.parametrize("pause", [0.15, 10.0])
+def test_what_a_pause_loses_is_counted(processes, plant, pause):
+    """A recorder stopped for a while (SIGSTOP) catches up as far as the middleware holds what was sent meanwhile."""
     path = processes.folder / "bag"
     recorder = start(processes, path)
     wait_for(processes, path, recorder, 500)
     os.kill(recorder.pid, signal.SIGSTOP)
-    time.sleep(0.15)
+    time.sleep(pause)
     os.kill(recorder.pid, signal.SIGCONT)
-    wait_for(processes, path, recorder, 1500)
+    wait_for(processes, path, recorder, 1500 + 2 * 490)
     status, said = processes.end(recorder)
     assert status == 0
-    assert "none lost" in said
+    missing = 0
+    for topic in ("/joint_states", "/armature"):
+        stamps = [int.from_bytes(data[4:8], "little") * 10**9 + int.from_bytes(data[8:12], "little")
+                  for name, _, data in messages(path) if name == topic]  # fmt: skip
+        missing += (stamps[-1] - stamps[0]) // 2_040_000 + 1 - len(stamps)
+    lost = said.rsplit("; ", 1)[1].split()[0]
+    if pause < 1.0:
+        assert lost == "none"
+    else:
+        assert 0 < int(lost) <= missing

@@ -12,6 +12,7 @@ from rosbags.rosbag2 import Reader
 
 from aeropend_ident.bag import Bag
 from aeropend_ident.recording import read
+from aeropend_ident.replay import Plan
 
 FLOAT = "std_msgs/msg/Float64"
 
@@ -241,6 +242,43 @@ def heard(bags, processes, values, *parameters, remap=(), number=None, step_ns=2
     assert processes.wait(recorder)[0] == 0
     found = list(Bag(processes.folder / "bag").messages(lambda name, _: name == topic))
     return [np.frombuffer(data[4:12]).item() for _, _, data in found], np.array([received for _, received, _ in found])
+
+
+def test_messages_come_in_the_order_they_were_received(bags, tmp_path):
+    made = commands(bags, np.arange(200) / 200, 5_000_000)
+    rng = np.random.default_rng(0)
+    shuffled = [made.messages[at] for at in np.argsort(np.arange(200) + rng.uniform(0, 150, 200))]
+    plan = Plan(bags.write(tmp_path / "bag", bags.Content(shuffled)))
+    assert [(received, data) for received, _, data in plan.events()] == [one[2:] for one in made.messages]
+    assert plan.duration == pytest.approx(199 * 0.005)
+
+
+def test_what_is_in_force_at_the_start_comes_first(bags, tmp_path):
+    rig = bags.content(50, "/rig1")
+    path = bags.write(tmp_path / "bag", rig)
+    plan = Plan(path, start=25 * 0.00204)
+    events = [(connection.topic, received - plan.start, data) for received, connection, data in plan.events()]
+    assert {events[0], events[1]} == {
+        ("/rig1/duty_command", 0, bags.number(0.1)),
+        ("/rig1/reference", 0, bags.number(0.4)),
+    }
+    later = [one for one in rig.messages if one[2] >= plan.start]
+    assert events[2:] == [(topic, received - plan.start, data) for topic, _, received, data in later]
+    assert [one[1] for one in events] == sorted(one[1] for one in events)
+
+
+def test_topics_are_chosen_by_name_and_namespace(bags, tmp_path):
+    both = bags.content(20, "/rig1").messages + bags.content(20, "/rig2").messages
+    path = bags.write(tmp_path / "bag", bags.Content([*both, ("/duty_command_2", FLOAT, both[0][2], bags.number(1.0))]))
+
+    def chosen(*arguments):
+        return {topic for topic, _ in Plan(path, *arguments).connections}
+
+    assert chosen(["duty_command"]) == {"/rig1/duty_command", "/rig2/duty_command"}
+    assert chosen(["duty_command"], "rig2") == {"/rig2/duty_command"}
+    assert chosen(["/rig1/armature", "duty_command_2"]) == {"/rig1/armature", "/duty_command_2"}
+    assert chosen([], "/rig1") == {"/rig1/joint_states", "/rig1/armature", "/rig1/duty_command"}
+    assert len(chosen()) == 7
 
 
 def test_timing_is_kept(bags, processes):
