@@ -21,8 +21,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from std_msgs.msg import Float64
 
-from aeropend_control.excitation import KINDS, Excitation
 from aeropend_sim import interface
+from aeropend_sim.excitation import KINDS, Excitation
 from aeropend_sim.parameters import SAMPLE_PERIOD
 from aeropend_sim.ros import Diagnostics, Setting, UserError, Worker, overrides, read_settings, run, usage
 
@@ -184,12 +184,10 @@ class Excite(Node):
         return False
 
     def _rest(self) -> None:
-        """Send duty 0 and make sure that it arrived."""
-        self._publisher.publish(Float64(data=0.0))
-        if self._publisher.get_subscription_count() == 0:
-            return
-        if not self._publisher.wait_for_all_acked(Duration(seconds=2)):
-            self.get_logger().warn("duty 0 was sent, but not every listener has confirmed it")
+        """Send duty 0 ten times over 0.2 s: confirmation by the middleware would take up to 3 s (its heartbeat)."""
+        for _ in range(10):
+            self._publisher.publish(Float64(data=0.0))
+            time.sleep(0.02)
 
     def _report(self) -> tuple[str, dict[str, object]]:
         values = {
