@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from aeropend_ident.gap.signals import Signals, from_arrays
 from aeropend_sim import rig
 from aeropend_sim.effects import CATALOGUE

@@ -21,12 +21,12 @@ from datetime import datetime
 from pathlib import Path
 
 import numpy as np
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import Model, load, save
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from aeropend_ident.diagnose import Parser
+from aeropend_sim.effects import CATALOGUE
+from aeropend_sim.parameters import Model, load, save
 
 NUMBER_ERROR = 0.03
 """Each number of the plant is off from the model by up to this share: no model's numbers are exact."""
@@ -182,7 +182,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     assert isinstance(which, dict)
     right = is_right(drawn, which)
     truth = ", ".join(f"{k} = {v:.4g}" for p in rig.effects.values() for k, v in p.items())
-    print(f"hidden in the plant: {drawn}{f' ({truth})' if truth else ''}: the verdict is {'right' if right else 'WRONG'}")
+    hidden = f"{drawn} ({truth})" if truth else drawn
+    print(f"hidden in the plant: {hidden}: the verdict is {'right' if right else 'WRONG'}")
     return 0 if right else 1
 
 

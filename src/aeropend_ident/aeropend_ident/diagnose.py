@@ -19,8 +19,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from aeropend_sim.effects import CATALOGUE, PARAMETER_MISMATCH
-from aeropend_sim.parameters import PARAMETERS, PRESETS, Model, ModelError, load, save
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -28,6 +26,8 @@ from aeropend_ident import recording
 from aeropend_ident.gap import report
 from aeropend_ident.gap.diagnosis import Diagnosis, diagnose
 from aeropend_ident.gap.signals import Signals, from_recording
+from aeropend_sim.effects import CATALOGUE, PARAMETER_MISMATCH
+from aeropend_sim.parameters import PARAMETERS, PRESETS, Model, ModelError, load, save
 
 FORMAT = 1
 FILES = ("diagnosis.json", "report.html", "augmented.yaml")
@@ -104,7 +104,9 @@ def document(diagnosis: Diagnosis, bags: Sequence[str], model: str, seconds: flo
 def verdict_lines(body: Mapping[str, object]) -> list[str]:
     """The verdict in a few lines for the terminal."""
     which, where, shrink = body["which"], body["where"], body["shrink"]
-    assert isinstance(which, dict) and isinstance(where, dict) and isinstance(shrink, dict)
+    assert isinstance(which, dict)
+    assert isinstance(where, dict)
+    assert isinstance(shrink, dict)
     lines = []
     if which["verdict"] == "none":
         lines.append("verdict: none. The model explains the recording once its numbers are refitted.")
@@ -114,10 +116,10 @@ def verdict_lines(body: Mapping[str, object]) -> list[str]:
     else:
         lines.append(f"verdict: {' and '.join(which['effects'])} ({where['place']})")
     found = {c["effect"]: c for c in reversed(which["candidates"])}
-    for effect in which["effects"]:
-        lines.append(f"  {effect}: {describe(found[effect])}")
-    for pair in which["not_separable"]:
-        lines.append(f"  not separable from this recording: {' and '.join(pair)}")
+    lines += [f"  {effect}: {describe(found[effect])}" for effect in which["effects"]]
+    lines += [f"  not separable from this recording: {' and '.join(pair)}" for pair in which["not_separable"]]
+    if which["next_experiment"]:
+        lines.append(f"  next: {experiment(which['next_experiment'])}")
     gap, after, bottom = (100.0 * shrink[k] for k in ("gap", "gap_after", "floor"))
     line = f"gap on held-out data: {gap:.1f} % of the signals' spread, {after:.1f} % with the augmented model"
     if shrink["closed"] is None:
@@ -126,6 +128,14 @@ def verdict_lines(body: Mapping[str, object]) -> list[str]:
         interval = "" if shrink["low"] is None else f" ({100 * shrink['low']:.0f} to {100 * shrink['high']:.0f} %)"
         lines.append(f"{line}, floor {bottom:.1f} %: {100 * shrink['closed']:.0f} %{interval} of what can close")
     return lines
+
+
+def experiment(advice: Mapping[str, object]) -> str:
+    """The advised experiment as a command."""
+    parameters = advice["excite"]
+    assert isinstance(parameters, dict)
+    command = "excite --ros-args " + " ".join(f"-p {k}:={v}" for k, v in parameters.items())
+    return f"{command} ({advice['why']})" if parameters else str(advice["why"])
 
 
 def describe(candidate: Mapping[str, object]) -> str:
@@ -159,7 +169,7 @@ def write(out: Path, files: Mapping[str, str], augmented: Model, comment: str, *
                 (Path(place) / name).write_text(text, encoding="utf-8")
             save(augmented, Path(place) / "augmented.yaml", comment)
             for name in FILES:
-                os.replace(Path(place) / name, out / name)
+                (Path(place) / name).replace(out / name)
     except OSError as error:
         if made:
             shutil.rmtree(out, ignore_errors=True)
@@ -184,8 +194,8 @@ def run(options: argparse.Namespace, command: str, console: Console) -> Diagnosi
     with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console,
                   transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("reading", total=1.0)
-        for bag in options.bags:
-            signals.append(from_recording(recording.read(bag, options.namespace), model.sensing, options.held_out))
+        signals += [from_recording(recording.read(bag, options.namespace), model.sensing, options.held_out)
+                    for bag in options.bags]
         result = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal,
                           progress=lambda what, share: bar.update(task, description=what, completed=share))
     body = document(result, options.bags, options.model, time.monotonic() - started)

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rigs import BENCH, drawn_rig, steps
+
 from aeropend_sim import rig
 from aeropend_sim.parameters import load
-from rigs import BENCH, drawn_rig, steps
 
 KEYS = ["format", "bags", "model", "duration_s", "samples", "train_s", "held_out_s", "channels", "where", "which",
         "shrink", "notes", "seconds"]

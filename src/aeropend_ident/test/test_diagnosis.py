@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Known truth in, the same truth out: every effect of the catalogue at its default size, in rigs whose numbers are off."""
+"""Known truth in, the same truth out: every effect at its default size, in rigs whose numbers are off."""
 
 import json
 
 import numpy as np
 import pytest
-from aeropend_sim import rig
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import SAMPLE_PERIOD, Model
 from rigs import BENCH, drawn_rig, recorded, steps
 
 from aeropend_ident.gap.diagnosis import diagnose
 from aeropend_ident.gap.signals import from_arrays
+from aeropend_sim import rig
+from aeropend_sim.effects import CATALOGUE
+from aeropend_sim.parameters import SAMPLE_PERIOD, Model
 
 RANDOM = {"gust", "speed_spikes"}
 

@@ -43,7 +43,8 @@ def test_estimates_lie_within_their_intervals():
 def test_the_right_structure_has_the_higher_evidence_and_the_wrong_one_does_not_run_to_absurd_numbers():
     noise = RNG.standard_normal(len(T))
     data = line(noise, bend=0.3)
-    without, with_ = fit(data, [Unknown("slope", 2.0, 0.1), OFFSET]), fit(data, [Unknown("slope", 2.0, 0.1), OFFSET, BEND])
+    known = Unknown("slope", 2.0, 0.1)
+    without, with_ = fit(data, [known, OFFSET]), fit(data, [known, OFFSET, BEND])
     counts = with_.independent
     assert with_.evidence(counts) - without.evidence(counts) > 100.0
     assert with_.values["bend"] == pytest.approx(0.3, abs=3 * with_.sd["bend"])

@@ -99,7 +99,7 @@ _ENTRIES = (
            {"amplitude": P("rad", 0.0, 0.06, 0.0, 0.5, "amplitude of the error"),
             "phase": P("rad", 0.5, 0.5, -math.pi, math.pi, "direction of the offset")}, in_equations=False),
     Effect("current_gain", "sensing", "i (1 + gain) is read",
-           {"gain": P("-", 0.0, 0.15, -0.9, 3.0, "relative error of the reading")}, in_equations=False),
+           {"gain": P("-", 0.0, 0.3, -0.9, 3.0, "relative error of the reading")}, in_equations=False),
     Effect("current_offset", "sensing", "i + bias is read",
            {"bias": P("A", 0.0, 0.06, -2.0, 2.0, "current read at zero")}, in_equations=False),
     Effect("voltage_offset", "sensing", "v + bias is read",

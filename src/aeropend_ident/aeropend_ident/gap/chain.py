@@ -11,11 +11,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from aeropend_sim import actuator, dynamics, sensing
-from aeropend_sim.parameters import Model
 from numpy.typing import NDArray
 
 from aeropend_ident.gap.signals import Signals
+from aeropend_sim import actuator, dynamics, sensing
+from aeropend_sim.parameters import Model
 
 Array = NDArray[np.float64]
 Values = Mapping[str, float]
@@ -36,7 +36,7 @@ PLACE_OF_NUMBER = {
 
 
 def with_values(model: Model, values: Values) -> Model:
-    """The model with these values: `R_a` a number, `coulomb_friction.accel` an effect's; others (initial) are left out."""
+    """The model with these values: `R_a` is a number, `coulomb_friction.accel` an effect's; `initial.*` is left out."""
     numbers = dict(model.model)
     effects = {k: dict(v) for k, v in model.effects.items()}
     for name, value in values.items():

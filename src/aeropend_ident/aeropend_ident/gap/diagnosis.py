@@ -8,19 +8,26 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import MODEL_NAMES, Model
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from aeropend_ident.gap import gust as gusts
 from aeropend_ident.gap import shrink, where
 from aeropend_ident.gap.chain import BLOCKS, PLACE_OF_NUMBER, Chains, with_values
+from aeropend_ident.gap.experiment import next_experiment
 from aeropend_ident.gap.fit import Fit, Unknown, fit
 from aeropend_ident.gap.signals import CHANNELS, Signals
 from aeropend_ident.gap.which import (
-    EFFECT_ODDS, Findings, Hypothesis, Weighed, initial_unknowns, number_unknowns, search,
+    EFFECT_ODDS,
+    Findings,
+    Hypothesis,
+    Weighed,
+    initial_unknowns,
+    number_unknowns,
+    search,
 )
+from aeropend_sim.effects import CATALOGUE
+from aeropend_sim.parameters import MODEL_NAMES, Model
 
 Array = NDArray[np.float64]
 
@@ -30,6 +37,9 @@ GOOD_ENOUGH = 1.3
 
 RANDOM_TORQUE = 0.35
 """A torque on the arm passes as random while the state explains less than this share of it."""
+
+UNDECIDED = 0.05
+"""Probability from which on a rival is not ruled out."""
 
 FALSE_CAPTURES = 0.02
 """1/s of false speed periods that any rig may show."""
@@ -82,7 +92,6 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
     torque, misfit, variables = _random_torque(chains, findings)
     progress("fitting the whole chain", 0.75)
     values, sd = _joint(chains, findings)
-    initial = {n: v for n, v in values.items() if n.startswith("initial.")}
     base_values = {n: v for f in findings.values() for n, v in f.base.values.items() if n.startswith("initial.")}
     progress("measuring the gap", 0.9)
     before = [shrink.free_run(model, s, chains.own(base_values, k)) for k, s in enumerate(recordings)]
@@ -97,7 +106,7 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
     best = scorer.squared(values)
     ablated = {h.name: max(scorer.squared({**values, **back}) - best, 0.0)
                for h, (_, back) in zip(found, groups, strict=True)}
-    unexplained = _unexplained(findings, scorer, gap_after, floors)
+    unexplained = _unexplained(findings, gap_after, floors)
     if torque is not None:
         ablated["gust"] = unexplained.pop("arm", 0.0)
     if spikes is not None:
@@ -126,6 +135,7 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
     else:
         place = next((h.place for h in found if h.name == order[0]), None) or CATALOGUE[order[0]].place
 
+    undecided = _not_separable(findings)
     augmented = _augmented(model, values, torque, spikes)
     names = [c for c in CHANNELS if c in gap_before.rms]
     body: dict[str, object] = {
@@ -136,7 +146,8 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
                   "numbers": {n: {"nominal": model.model[n], **_interval(values[n], sd[n])}
                               for n in MODEL_NAMES if n in values},
                   "unexplained": reasons,
-                  "not_separable": _not_separable(findings), "next_experiment": None},
+                  "not_separable": [[a.hypothesis.effect, b.hypothesis.effect] for a, b in undecided],
+                  "next_experiment": _next_experiment(model, recordings[0], undecided, values)},
         "shrink": {"gap": gap_before.total, "gap_after": gap_after.total, "floor": scorer.bottom(gap_before, floors),
                    "closed": share, "low": low, "high": high},
     }
@@ -276,8 +287,7 @@ def _left(findings: Mapping[str, Findings], torque: bool) -> dict[str, float]:
     return left
 
 
-def _unexplained(findings: Mapping[str, Findings], scorer: _Scorer, after: shrink.Gap, floors: Mapping[str, float]
-                 ) -> dict[str, float]:
+def _unexplained(findings: Mapping[str, Findings], after: shrink.Gap, floors: Mapping[str, float]) -> dict[str, float]:
     """Place -> squared gap that is left there: what the cut chain leaves above the floor."""
     home = {"v_a": "actuator", "i_a": "electrical", "omega": "rotor", "theta": "arm"}
     left: dict[str, float] = {}
@@ -362,21 +372,28 @@ def _candidates(findings: Mapping[str, Findings], values: Mapping[str, float], s
         if extra is not None:
             rows[extra.hypothesis.name] = {
                 "effect": extra.hypothesis.effect, "place": extra.hypothesis.place, "probability": extra.probability,
-                "parameters": {n.partition(".")[2]: _interval(v, extra.fit.sd[n]) for n, v in extra.fit.values.items()},
+                "parameters": {n.partition(".")[2]: _interval(v, extra.fit.sd[n])
+                               for n, v in extra.fit.values.items()},
                 "gap_after": gap_after}
     return sorted(rows.values(), key=lambda row: -row["probability"])  # type: ignore[operator]
 
 
-def _not_separable(findings: Mapping[str, Findings]) -> list[list[str]]:
-    """Pairs of effects that this recording cannot tell apart: the first and rivals nearly as probable."""
-    pairs = []
-    for f in findings.values():
-        for round_ in [*f.found, f.rivals]:
-            if round_ and round_[0].probability > 0.05:
-                first = round_[0]
-                pairs += [[first.hypothesis.effect, w.hypothesis.effect] for w in round_[1:]
-                          if w.probability > 0.05 and w.hypothesis.effect != first.hypothesis.effect]
-    return pairs
+def _not_separable(findings: Mapping[str, Findings]) -> list[tuple[Weighed, Weighed]]:
+    """Pairs that this recording cannot tell apart: the first of a round and rivals nearly as probable."""
+    return [(round_[0], w) for f in findings.values() for round_ in [*f.found, f.rivals]
+            if round_ and round_[0].probability > UNDECIDED for w in round_[1:]
+            if w.probability > UNDECIDED and w.hypothesis.effect != round_[0].hypothesis.effect]
+
+
+def _next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[Weighed, Weighed]],
+                     values: Mapping[str, float]) -> dict[str, object] | None:
+    """The experiment that would tell the closest pair apart; None where nothing is open."""
+    if not pairs:
+        return None
+    first, second = max(pairs, key=lambda pair: pair[1].probability)
+    own = {u.name: _neutral(model, u.name) for w in (first, second) for u in w.hypothesis.starts[0]}
+    one, other = ({**values, **own, **w.fit.values} for w in (first, second))
+    return next_experiment(model, signals, one, other, (first.hypothesis.effect, second.hypothesis.effect))
 
 
 def _augmented(model: Model, values: Mapping[str, float], torque: Weighed | None, spikes: Weighed | None) -> Model:

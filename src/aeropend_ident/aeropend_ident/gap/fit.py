@@ -50,7 +50,7 @@ class Unknown:
         return float(self.mean * np.exp(self.sd * z)) if self.log else float(self.mean + self.sd * z)
 
     def slope(self, z: float) -> float:
-        """d value / d z."""
+        """D value / d z."""
         return self.value(z) * self.sd if self.log else self.sd
 
 

@@ -121,7 +121,8 @@ def fit_gust(residual: Array, theta: Array, gravity: float, damping: float, nois
     cost(z)
     e = innovations
     whiteness = float(np.mean(e[1:] * e[:-1]) / max(float(np.mean(e * e)), 1e-300))
-    return Gust(math.exp(z[0]), math.exp(z[1]), width[0], width[1], -best.fun - without, torque.copy(), index, whiteness)
+    return Gust(math.exp(z[0]), math.exp(z[1]), width[0], width[1], -best.fun - without, torque.copy(), index,
+                whiteness)
 
 
 def follows_state(torque: Array, columns: list[Array]) -> float:

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
 from aeropend_ident.gap.chain import smooth
@@ -28,10 +27,10 @@ Array = NDArray[np.float64]
 
 VARIABLES = {
     "theta": ("θ", "arm angle", "rad"), "theta_dot": ("θ̇", "arm rate", "rad/s"),
-    "omega": ("ω", "rotor speed", "rad/s"), "i_a": (Markup("i<sub>a</sub>"), "armature current", "A"),
-    "v_a": (Markup("v<sub>a</sub>"), "armature voltage", "V"), "duty": ("τ", "duty", ""), "t": ("t", "time", "s"),
+    "omega": ("ω", "rotor speed", "rad/s"), "i_a": ("i_a", "armature current", "A"),
+    "v_a": ("v_a", "armature voltage", "V"), "duty": ("τ", "duty", ""), "t": ("t", "time", "s"),
 }
-"""Symbol, plain name and unit of what is plotted."""
+"""Symbol (what follows _ stands lower), plain name and unit of what is plotted."""
 
 SIGNAL_AFTER = dict(zip(PLACES, ("v_a", "i_a", "omega", "f", "theta", "reading"), strict=True))
 """What each part of the chain hands on."""
@@ -70,7 +69,7 @@ def render(diagnosis: Diagnosis, document: Mapping[str, object], command: str) -
     doc: Any = document
     environment = Environment(loader=PackageLoader("aeropend_ident", "gap"), autoescape=True, trim_blocks=True,
                               lstrip_blocks=True, undefined=StrictUndefined)
-    environment.filters.update(quantity=quantity, percent=percent, probability=probability, breakable=breakable)
+    environment.filters.update(quantity=quantity, percent=percent, probability=probability)
     candidates = [_candidate(c, doc) for c in doc["which"]["candidates"]]
     shown = [c for c in candidates if c["found"] or c["probability"] >= PROBABLE]
     numbers, reach = _numbers(doc)
@@ -139,11 +138,6 @@ def probability(p: float) -> str:
     return percent(min(max(p, 1e-6), 1.0 - 1e-6))
 
 
-def breakable(name: str) -> Markup:
-    """A name that may break behind its underscores."""
-    return Markup("_<wbr>").join(escape(part) for part in str(name).split("_"))
-
-
 def _magnitude(x: float) -> int:
     return math.floor(math.log10(abs(x))) if x != 0.0 else 0
 
@@ -169,16 +163,6 @@ def _with_unit(text: str, unit: str) -> str:
 def _minus(formula: str) -> str:
     """A formula with its hyphens as minus signs; those between letters stay."""
     return re.sub(r"(?<![A-Za-z])-", "−", formula)
-
-
-def _listed(items: Iterable[object]) -> Markup:
-    parts = [escape(x) for x in items]
-    head = Markup(", ").join(parts[:-1])
-    return Markup(" and ").join([head, parts[-1]] if head else parts[-1:])
-
-
-def _code(name: object) -> Markup:
-    return Markup("<code>{}</code>").format(name)
 
 
 def _ends(low: float, high: float) -> list[str]:
@@ -239,26 +223,30 @@ def _verdict(doc: Any, candidates: Sequence[dict[str, Any]]) -> dict[str, Any]:
               "to which nothing was fitted")
     if share is None:
         judged = "has nothing to close: the gap is within the noise of the readings"
+    numbers = [(c["number"], PARAMETERS[f"model.{c['number']}"].description.partition(":")[0])
+               for c in found if c["number"]]
+    effects = [c["effect"] for c in found if not c["number"]]
+    are = "is off." if len(numbers) == 1 else "are off."
     if which["verdict"] == "none":
-        sentence = Markup("The model lacks nothing that this recording shows.")
+        sentence = [("", "The model lacks nothing that this recording shows.")]
         then = f"Refitting its numbers {judged}."
     elif which["verdict"] == "unknown":
-        sentence = Markup("The model lacks something that is not in the catalogue; it shows most in the {} part of the "
-                          "chain.").format(doc["where"]["place"])
+        sentence = [("", "The model lacks something that is not in the catalogue; it shows most in the "
+                         f"{doc['where']['place']} part of the chain.")]
         then = f"Everything that is known, refitted and added, {judged}."
-    elif len(found) == 1 and found[0]["number"]:
-        name = found[0]["number"]
-        sentence = Markup("The structure of the model is right, but {} ({}) is off.").format(
-            _code(name), PARAMETERS[f"model.{name}"].description.partition(":")[0])
-        then = f"Correcting it, with the other numbers refitted, {judged}."
-    elif len(found) == 1:
-        sentence = Markup("The model lacks {}: {}.").format(
-            _code(found[0]["effect"]), found[0]["physics"].partition(": ")[0])
-        then = f"Adding it, with the numbers refitted, {judged}."
+    elif not effects:
+        sentence = [("", "The structure of the model is right, but "), *_listed([n for n, _ in numbers]),
+                    ("", f" ({' and '.join(dict.fromkeys(what for _, what in numbers))}) {are}")]
+        then = f"Correcting {'it' if len(numbers) == 1 else 'them'}, with the other numbers refitted, {judged}."
     else:
-        names = [_code(c["number"] or c["effect"]) for c in found] or [_code(n) for n in which["effects"]]
-        sentence = Markup("The model lacks {} effects: {}.").format(len(names), _listed(names))
-        then = f"Adding them, with the numbers refitted, {judged}."
+        sentence = [("", f"The model lacks {f'{len(effects)} effects: ' if len(effects) > 1 else ''}"), *_listed(effects)]
+        if numbers:
+            sentence += [("", ", and "), *_listed([n for n, _ in numbers]), ("", f" {are}")]
+        elif len(effects) == 1:
+            sentence += [("", f": {found[0]['physics'].partition(': ')[0]}.")]
+        else:
+            sentence += [("", ".")]
+        then = f"Adding {'it' if len(found) == 1 else 'them'}, with the numbers refitted, {judged}."
     if share is not None and share < 0.5 and which["effects"] and which["verdict"] != "unknown":
         then += " What is random in it can be named and sized, but not predicted: that part of the gap stays open."
     return {"sentence": sentence, "then": then, "lines": lines, "between": between,
@@ -269,6 +257,14 @@ def _line(candidate: dict[str, Any], doc: Any) -> dict[str, Any]:
     nominal = doc["which"]["numbers"].get(candidate["number"], {}).get("nominal", math.nan)
     unit = PARAMETERS[f"model.{candidate['number']}"].unit if candidate["number"] else ""
     return {**candidate, "nominal": _with_unit(exact(nominal), unit) if candidate["number"] else ""}
+
+
+def _listed(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Names as parts of a sentence: each a kind (`code` or none) and a text."""
+    parts = [("code", names[0])]
+    for name in names[1:-1]:
+        parts += [("", ", "), ("code", name)]
+    return [*parts, ("", " and "), ("code", names[-1])] if len(names) > 1 else parts
 
 
 def _channels(doc: Any) -> list[dict[str, Any]]:
@@ -320,7 +316,7 @@ def _experiment(experiment: Any) -> dict[str, Any] | None:
     if not experiment:
         return None
     settings = [f"-p {shlex.quote(f'{name}:={_ros(value)}')}" for name, value in experiment["excite"].items()]
-    return {"why": experiment["why"], "command": " ".join(["excite --ros-args", *settings])}
+    return {"why": experiment["why"], "command": " ".join(["excite --ros-args", *settings]) if settings else ""}
 
 
 def _ros(value: object) -> str:

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from aeropend_sim import actuator, dynamics, sensing
-from aeropend_sim.parameters import Model
 from numpy.typing import NDArray
 
 from aeropend_ident.gap.chain import mean_speed, with_values
 from aeropend_ident.gap.signals import CHANNELS, Signals
+from aeropend_sim import actuator, dynamics, sensing
+from aeropend_sim.parameters import Model
 
 Array = NDArray[np.float64]
 
@@ -35,14 +35,16 @@ def free_run(model: Model, signals: Signals, values: Mapping[str, float] | None 
     values = values or {}
     m = with_values(model, values)
     n, omega = m.numbers(), values.get("initial.omega", 0.0)
-    state = dynamics.State(i_a=float(actuator.current_at(n, omega)), omega=omega, theta=values.get("initial.theta", 0.0),
-                           theta_dot=values.get("initial.theta_dot", 0.0), thrust=float(actuator.thrust(n, omega)))
+    state = dynamics.State(i_a=float(actuator.current_at(n, omega)), omega=omega,
+                           theta=values.get("initial.theta", 0.0), theta_dot=values.get("initial.theta_dot", 0.0),
+                           thrust=float(actuator.thrust(n, omega)))
     run = dynamics.simulate(m, signals.duty, signals.period, state)
     e = m.effects
     return {
         "theta": sensing.angle_reading(run.theta, run.theta_dot, sensing.prepare(m, signals.period)),
         "omega": _held_speed(run, signals),
-        "i_a": run.i_a * (1.0 + e.get("current_gain", {}).get("gain", 0.0)) + e.get("current_offset", {}).get("bias", 0.0),
+        "i_a": (run.i_a * (1.0 + e.get("current_gain", {}).get("gain", 0.0))
+                + e.get("current_offset", {}).get("bias", 0.0)),
         "v_a": run.v_a + e.get("voltage_offset", {}).get("bias", 0.0),
     }
 
@@ -55,7 +57,7 @@ def _held_speed(run: dynamics.Trajectory, signals: Signals) -> Array:
     speed = mean_speed(run.rotor_angle, p.time, p.period, signals.period)
     last = np.searchsorted(p.index, np.arange(len(signals)), side="right") - 1
     held = np.where(last >= 0, speed[np.maximum(last, 0)], 0.0)
-    # where the rig reads no speed, the model counts as stopped too if it would have shown at most one pulse in that time
+    # where the rig reads no speed, the model counts as stopped too if it would have shown one pulse at most
     stopped = signals.omega == 0.0
     back = np.maximum(np.arange(len(signals)) - round(sensing.SPEED_TIMEOUT / signals.period), 0)
     slow = run.rotor_angle - run.rotor_angle[back] < p.period[0] * p.omega[0]
@@ -123,7 +125,7 @@ def floor(signals: Signals, start: int, stop: int) -> dict[str, float]:
 
 def closed(before: Gap, after: Gap, floors: Mapping[str, float], seed: int = 0
            ) -> tuple[float | None, float | None, float | None]:
-    """Share of the closable gap that closed, with its 95 % interval by a block bootstrap; None where nothing was open."""
+    """Share of the closable gap that closed, its 95 % interval by a block bootstrap; None where nothing was open."""
     bottom = float(np.sqrt(np.mean([(floors[c] / before.spread[c]) ** 2 for c in before.rms])))
     open_ = before.total - bottom
     if open_ <= 0.1 * bottom:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording offers to the diagnosis: channels on a uniform grid, their noise, and the pulses behind the speed."""
+"""What a recording offers to the diagnosis: channels on a uniform grid, their noise, the pulses behind the speed."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.sensing import SPEED_TIMEOUT
 from numpy.typing import NDArray
 
 from aeropend_ident.recording import Recording, RecordingError
+from aeropend_sim.effects import CATALOGUE
+from aeropend_sim.sensing import SPEED_TIMEOUT
 
 Array = NDArray[np.float64]
 
@@ -127,7 +127,7 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
         raise RecordingError(f"{name}: no duty was recorded (armature.percentage or duty_command); "
                              "without it the model has no input")
     duty = _held(columns["duty"])
-    train = max(1, int(round(n * (1.0 - held_out))))
+    train = max(1, round(n * (1.0 - held_out)))
     pulses = None
     if sensing["speed_pulses_per_rev"] > 0.0 and np.isfinite(columns["omega"]).any():
         pulses = find_pulses(columns["omega"], period, sensing)
@@ -174,7 +174,7 @@ def find_pulses(omega: Array, period: float, sensing: Mapping[str, float]) -> Pu
             rest -= max(round(rest / length[j - 1]), 0) * length[j - 1]
         starts_anew = stopped[j] and length[j] < SPEED_TIMEOUT
         alone = j + 1 < len(at) and speed[j] > PEAK * max(speed[j - 1], speed[j + 1])
-        false[j] = alone or abs(rest) > 1.01 * period + 2.0 * sensing["speed_tick"] and not starts_anew
+        false[j] = alone or (abs(rest) > 1.01 * period + 2.0 * sensing["speed_tick"] and not starts_anew)
     time = (at - 0.5) * period
     slope = np.gradient(speed, time) if len(at) > 2 else np.zeros(len(at))
     tick = np.maximum(sensing["speed_tick"], 1e-6) * speed / np.maximum(length, 1e-9) if len(at) else np.zeros(0)

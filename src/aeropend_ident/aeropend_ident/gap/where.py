@@ -6,8 +6,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-from aeropend_sim.effects import PLACES
 from numpy.typing import NDArray
+
+from aeropend_sim.effects import PLACES
 
 Array = NDArray[np.float64]
 

@@ -9,11 +9,11 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
-from aeropend_sim.effects import CATALOGUE, PARAMETER_MISMATCH
-from aeropend_sim.parameters import PARAMETERS, Model
 
 from aeropend_ident.gap.chain import BLOCKS, PLACE_OF_NUMBER, Chains
 from aeropend_ident.gap.fit import Fit, Unknown, fit, screen
+from aeropend_sim.effects import CATALOGUE, PARAMETER_MISMATCH
+from aeropend_sim.parameters import PARAMETERS, Model
 
 NUMBER_SD = 0.05
 """Relative standard deviation of a nominal number, unless it is known better."""
@@ -220,8 +220,9 @@ def _search_block(chains: Chains, block: str, candidates: list[Hypothesis], wher
         current = findings.final
         open_ = [h for h in candidates if h.name not in {g.name for g in findings.effects}]
         chosen = _shortlist(chains, block, open_, known, current)
-        fits = list(pool.map(lambda pair: _try(chains, block, *pair, known, current, downstream, where[pair[0].name]),
-                             chosen))
+        work = [pool.submit(_try, chains, block, h, start, known, current, downstream, where[h.name])
+                for h, start in chosen]
+        fits = [w.result() for w in work]
         rivals = _weigh(block, [h for h, _ in chosen], fits, current, downstream, where)
         if not rivals:
             break
