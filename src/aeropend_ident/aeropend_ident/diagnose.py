@@ -199,7 +199,7 @@ def run(options: argparse.Namespace, command: str, console: Console) -> Diagnosi
         result = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal,
                           progress=lambda what, share: bar.update(task, description=what, completed=share))
     body = document(result, options.bags, options.model, time.monotonic() - started)
-    lines = verdict_lines(body)
+    lines = [f"note: {note}" for s in signals for note in s.notes] + verdict_lines(body)
     files = {"diagnosis.json": json.dumps(body, indent=1, allow_nan=False) + "\n",
              "report.html": report.render(result, body, command)}
     write(out, files, result.augmented, f"{command}\n" + "\n".join(lines), overwrite=options.overwrite)

@@ -25,6 +25,12 @@ Stamps = NDArray[np.int64]
 
 CHANNELS = ("theta", "omega", "i_a", "v_a", "duty")
 
+OFF_GRID = 0.25
+"""Part of a period by which a step between stamps may miss the grid."""
+
+IRREGULAR = 0.01
+"""Share of steps off the grid from which on it is said."""
+
 _JOINT, _BATTERY, _FLOAT = "sensor_msgs/msg/JointState", "sensor_msgs/msg/BatteryState", "std_msgs/msg/Float64"
 _TOPICS = {
     "truth/joint_states": _JOINT,
@@ -261,7 +267,7 @@ class _Join:
         repeated = self.duplicates
         self.truth = self._truth(topics)
         self.duplicates = repeated
-        self.period, self.gaps = _grid(self.stamps)
+        self.period, self.gaps, self.irregular = _grid(self.stamps)
 
     def recording(self, path: str, namespace: str, *, complete: bool) -> Recording:
         """Say what there is to say, and hand over the arrays."""
@@ -275,6 +281,8 @@ class _Join:
             missing = int(self.gaps[:, 1].sum())
             are = "is" if missing == 1 else "are"
             self.notes.append(f"{_many(missing, 'sample')} {are} missing in {_many(len(self.gaps), 'gap')}")
+        if self.irregular > IRREGULAR * len(self.stamps) or len(self.gaps) > 0.25 * len(self.stamps):
+            self.notes.append("the stamps do not lie on one grid: two rigs on one topic, or most samples were lost")
         return Recording(
             path=path,
             namespace=namespace,
@@ -381,15 +389,20 @@ class _Join:
         return Truth(**self._placed(tables, ("theta", "theta_dot", "omega", "i_a", "v_a"))) if tables else None
 
 
-def _grid(stamps: Stamps) -> tuple[float, Stamps]:
-    """Estimate the period (s) and find the gaps: index of the sample before each, and samples missing."""
+def _grid(stamps: Stamps) -> tuple[float, Stamps, int]:
+    """Estimate the period (s), find the gaps and count the steps that fit no grid.
+
+    A gap is the index of the sample before it and the number of samples missing.
+    """
     steps = np.diff(stamps)
     if not len(steps):
-        return float("nan"), np.empty((0, 2), dtype=np.int64)
-    periods = np.maximum(np.rint(steps / np.median(steps)), 1).astype(np.int64)
+        return float("nan"), np.empty((0, 2), dtype=np.int64), 0
+    periods = np.rint(steps / np.median(steps)).astype(np.int64)
     before = np.flatnonzero(periods > 1)
-    period = float(steps[periods == 1].mean()) / 1e9  # gaps left out: a pause need not be a whole number of periods
-    return period, np.stack((before, periods[before] - 1), axis=1)
+    usual = np.abs(steps / np.median(steps) - 1.0) < OFF_GRID  # a pause need not be a whole number of periods
+    period = float(steps[usual].mean()) / 1e9
+    irregular = int(np.sum(np.abs(steps / np.median(steps) - periods) > OFF_GRID))
+    return period, np.stack((before, periods[before] - 1), axis=1), irregular
 
 
 def _many(number: int, what: str) -> str:

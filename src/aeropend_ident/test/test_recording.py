@@ -233,3 +233,12 @@ def test_big_endian(bags, tmp_path):
     assert [getattr(recording, name)[0] for name in CHANNELS] == [0.5, 8.0, 0.25, 1.5, 0.75]
     assert recording.command.tolist() == [0.75]
     assert recording.stamp_ns.tolist() == [5]
+
+
+def test_two_rigs_on_one_topic_are_noticed(bags, tmp_path):
+    one, other = bags.content(200), bags.content(200, seed=1)
+    shifted = [(topic, kind, received, bags.joint(received - 300_000 + 700_000, [0.0, NAN], [NAN, 1.0]))
+               for topic, kind, received, _ in other.messages if topic == "/joint_states"]
+    both = bags.Content(sorted(one.messages + shifted, key=lambda m: m[2]), {})
+    notes = read(bags.write(tmp_path / "bag", both)).notes
+    assert any("two rigs on one topic" in note for note in notes), notes

@@ -231,15 +231,16 @@ def _verdict(doc: Any, candidates: Sequence[dict[str, Any]]) -> dict[str, Any]:
         sentence = [("", "The model lacks nothing that this recording shows.")]
         then = f"Refitting its numbers {judged}."
     elif which["verdict"] == "unknown":
-        sentence = [("", "The model lacks something that is not in the catalogue; it shows most in the "
-                         f"{doc['where']['place']} part of the chain.")]
+        sentence = [("", "The model lacks something that the catalogue does not hold, in this part of the chain: "),
+                    ("", f"{doc['where']['place']}.")]
         then = f"Everything that is known, refitted and added, {judged}."
     elif not effects:
         sentence = [("", "The structure of the model is right, but "), *_listed([n for n, _ in numbers]),
                     ("", f" ({' and '.join(dict.fromkeys(what for _, what in numbers))}) {are}")]
         then = f"Correcting {'it' if len(numbers) == 1 else 'them'}, with the other numbers refitted, {judged}."
     else:
-        sentence = [("", f"The model lacks {f'{len(effects)} effects: ' if len(effects) > 1 else ''}"), *_listed(effects)]
+        count = f"{len(effects)} effects: " if len(effects) > 1 else ""
+        sentence = [("", f"The model lacks {count}"), *_listed(effects)]
         if numbers:
             sentence += [("", ", and "), *_listed([n for n, _ in numbers]), ("", f" {are}")]
         elif len(effects) == 1:
