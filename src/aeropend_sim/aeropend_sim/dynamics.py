@@ -27,8 +27,8 @@ from aeropend_sim.parameters import SAMPLE_PERIOD, Model
 
 Array = NDArray[np.float64]
 
-equation = njit(cache=True, forceinline=True)
-"""Compiles one equation into whatever calls it."""
+equation = njit(cache=True, forceinline=True, error_model="numpy")
+"""Compiles one equation into whatever calls it, without a test for zero before each division."""
 
 THRUST_PIVOT_SPEED = 150.0
 """rad/s at which `thrust_exponent` leaves the thrust as it is (contract section 4)."""
@@ -78,9 +78,10 @@ def lag(a: float, h: float) -> Lag:
 def _phi(exp_z: float, z: float) -> tuple[float, float, float]:
     """The functions of exponential integrators, φ_k(z) = Σ z^j / (j + k)!, for k = 1, 2, 3."""
     if abs(z) > 0.3:
-        p1 = (exp_z - 1.0) / z
-        p2 = (p1 - 1.0) / z
-        return p1, p2, (p2 - 0.5) / z
+        per_z = 1.0 / z
+        p1 = (exp_z - 1.0) * per_z
+        p2 = (p1 - 1.0) * per_z
+        return p1, p2, (p2 - 0.5) * per_z
     p3 = term = 1.0 / 6.0
     for j in range(4, 16):
         term *= z / j
@@ -118,6 +119,7 @@ class Extra(NamedTuple):
     gust_decay: float
     gust_kick: float
     per_free_inertia: float
+    per_width: float
 
 
 class State(NamedTuple):
@@ -231,7 +233,9 @@ def breakaway(d0: float, dm: float, d1: float, limit: float, s: float) -> tuple[
 
 @equation
 def brush_sign(i: float) -> float:
-    """tanh(i/0.02)."""
+    """tanh(i/0.02), to 4e-9."""
+    if abs(i) > 10.0 * BRUSH_CURRENT:
+        return math.copysign(1.0, i)
     return 1.0 - 2.0 / (1.0 + math.exp(2.0 * i / BRUSH_CURRENT))
 
 
@@ -248,13 +252,15 @@ def linearised_winding(i0: float, v: float, heat: float, c: Coefficients, e: Val
         current crosses the bend of the tanh.
     """
     resistance = x.R_total + x.R_a * e.winding_heating_gain * heat
+    if e.brush_drop_v_brush == 0.0:
+        return lag(resistance * c.per_L, c.h), 0.0, 1
     t = brush_sign(i0)
     stiffness = e.brush_drop_v_brush * (1.0 - t * t) / BRUSH_CURRENT
     k = lag((resistance + stiffness) * c.per_L, c.h)
     drop = e.brush_drop_v_brush * t - stiffness * i0
     i1 = k.decay * i0 + (1.0 - k.decay) * (v - drop) / (resistance + stiffness)
     pieces = 1
-    if e.brush_drop_v_brush > 0.0 and (i0 * i1 < 0.0 or min(abs(i0), abs(i1)) < 6.0 * BRUSH_CURRENT):
+    if i0 * i1 < 0.0 or min(abs(i0), abs(i1)) < 6.0 * BRUSH_CURRENT:
         pieces = 1 + min(15, int(abs(i1 - i0) / (0.2 * BRUSH_CURRENT)))
     return k, drop, pieces
 
@@ -284,8 +290,17 @@ def static_thrust(w: float, c: Coefficients, e: Values | None) -> float:
     """Thrust of a steady speed: f = k_thrust ω|ω|, thesis (3.3)."""
     if e is not None and e.thrust_exponent_n != 2.0:
         size = c.k_thrust * THRUST_PIVOT_SPEED**2 * (abs(w) / THRUST_PIVOT_SPEED) ** e.thrust_exponent_n
-        return size if w >= 0.0 else -size
+        return math.copysign(size, w)
     return c.k_thrust * w * abs(w)
+
+
+@equation
+def static_thrust_near(w: float, w0: float, f0: float, c: Coefficients, e: Values | None) -> float:
+    """As `static_thrust`, given f0 of a speed w0: if that is close, by the binomial series, which costs less."""
+    if e is None or e.thrust_exponent_n == 2.0 or abs(w - w0) >= 0.05 * abs(w0):
+        return static_thrust(w, c, e)
+    n, d = e.thrust_exponent_n, w / w0 - 1.0
+    return f0 * (1.0 + n * d * (1.0 + (n - 1.0) / 2.0 * d * (1.0 + (n - 2.0) / 3.0 * d * (1.0 + (n - 3.0) / 4.0 * d))))
 
 
 @equation
@@ -294,19 +309,25 @@ def arm_drive(sin_theta: float, theta: float, theta_dot: float, f: float, w: flo
     """Torque on the arm over its inertia, less dry friction: -(mgd/J) sin θ - (c/J) θ̇ + (L/J) f, thesis (3.2)."""
     if e is None:
         return (c.lever * f - c.damping * theta_dot) - c.gravity * sin_theta
-    f = f - e.axial_inflow_k * w * theta_dot
-    return ((c.lever * f - c.damping * theta_dot) - c.gravity * sin_theta
-            - e.quadratic_drag_k * theta_dot * abs(theta_dot)
-            - e.cable_torque_k * (theta - e.cable_torque_theta0)
-            + gust + flex_restoring(flex, flex_dot, e))
+    damping = c.damping + c.lever * e.axial_inflow_k * w + e.quadratic_drag_k * abs(theta_dot)
+    other = gust - e.cable_torque_k * (theta - e.cable_torque_theta0) + flex_restoring(flex, flex_dot, e)
+    return ((c.lever * f - damping * theta_dot) - c.gravity * sin_theta) + other
 
 
 @equation
-def near_ground(f: float, theta: float, e: Values | None) -> float:
-    """Thrust with the ground effect: f (1 + gain exp(-|θ|/width))."""
+def near_ground(theta: float, e: Values | None) -> float:
+    """Share by which the ground effect raises the thrust: gain exp(-|θ|/width)."""
     if e is None or e.ground_effect_gain == 0.0:
-        return f
-    return f * (1.0 + e.ground_effect_gain * math.exp(-abs(theta) / e.ground_effect_width))
+        return 0.0
+    return e.ground_effect_gain * math.exp(-abs(theta) / e.ground_effect_width)
+
+
+@equation
+def nearer_ground(g: float, theta: float, moved: float, e: Values | None, x: Extra | None) -> float:
+    """`near_ground` of an angle that has moved a little from theta, where it is g."""
+    if e is None or e.ground_effect_gain == 0.0:
+        return 0.0
+    return g + g * ((abs(theta) - abs(moved)) * x.per_width)
 
 
 @equation
@@ -336,22 +357,24 @@ def arm(y: float, yd: float, q: float, qd: float, f0: float, fm: float, f1: floa
     """
     s = 0.5 * c.h
     # One sine and cosine, in the middle; those of the ends by turning it: the stages need not wait for each other.
+    # So with the ground effect: where the arm would be without acceleration, then moved a little.
     d = s * yd
     sin_m, cos_m = sine_cosine(y + d)
     d2 = d * d
     sin_d, cos_d = d * (1.0 - d2 * (1.0 / 6.0 - d2 * (1.0 / 120.0))), 1.0 - d2 * (0.5 - d2 * (1.0 / 24.0))
     sin_1, cos_1 = sin_m * cos_d + cos_m * sin_d, cos_m * cos_d - sin_m * sin_d
-    f0 = near_ground(f0, y, e)
+    g0, gm, g1 = near_ground(y, e), near_ground(y + d, e), near_ground(y + 2.0 * d, e)
+    f0 += f0 * g0
     a1, b1 = arm_stage(sin_m * cos_d - cos_m * sin_d, y, yd, q, qd, f0, w0, friction, gust, c, e, x)
     bend = 0.5 * s * s * a1
     sin_m, middle, qm = near(sin_m, cos_m, bend), y + d + bend, q + s * (qd + 0.5 * s * b1)
-    fm = near_ground(fm, middle, e)
+    fm += fm * nearer_ground(gm, y + d, middle, e, x)
     a2, b2 = arm_stage(sin_m, middle, yd + s * a1, qm, qd + s * b1, fm, wm, friction, gust, c, e, x)
     a3, b3 = arm_stage(sin_m, middle, yd + s * a2, qm, qd + s * b2, fm, wm, friction, gust, c, e, x)
     bend = c.h * s * a3
     end = y + 2.0 * d + bend
     a4, b4 = arm_stage(near(sin_1, cos_1, bend), end, yd + c.h * a3, q + c.h * (qd + s * b3), qd + c.h * b3,
-                       near_ground(f1, end, e), w1, friction, gust, c, e, x)
+                       f1 + f1 * nearer_ground(g1, y + 2.0 * d, end, e, x), w1, friction, gust, c, e, x)
     return (y + c.h * (yd + s * (1.0 / 3.0) * (a1 + a2 + a3)), yd + s * (1.0 / 3.0) * (a1 + 2.0 * (a2 + a3) + a4),
             q + c.h * (qd + s * (1.0 / 3.0) * (b1 + b2 + b3)), qd + s * (1.0 / 3.0) * (b1 + 2.0 * (b2 + b3) + b4))
 
@@ -360,7 +383,7 @@ def arm(y: float, yd: float, q: float, qd: float, f0: float, fm: float, f1: floa
 def arm_stage(sin_y: float, y: float, yd: float, q: float, qd: float, f: float, w: float, friction: float, gust: float,
               c: Coefficients, e: Values | None, x: Extra | None) -> tuple[float, float]:
     """Accelerations (θ̈, q̈): the mast's mode carries a share of the arm's inertia and acts back with -q̈."""
-    drive = arm_drive(sin_y, y, yd, f, w, q, qd, gust, c, e) - friction
+    drive = arm_drive(sin_y, y, yd, f, w, q, qd, gust - friction, c, e)
     if e is None:
         return drive, 0.0
     acceleration = drive * x.per_free_inertia
@@ -391,7 +414,7 @@ def arm_with_dry_friction(y: float, yd: float, q: float, qd: float, f0: float, f
     limit = e.coulomb_friction_accel
     direction = 1.0 if yd > 0.0 else -1.0
     if yd == 0.0:
-        drive = arm_drive(math.sin(y), y, 0.0, near_ground(f0, y, e), w0, q, qd, gust, c, e)
+        drive = arm_drive(math.sin(y), y, 0.0, f0 * (1.0 + near_ground(y, e)), w0, q, qd, gust, c, e)
         if abs(drive) <= limit:  # it sticks; the mast swings on alone
             q, qd = mast_alone(q, qd, c, e)
             return y, 0.0, q, qd
@@ -401,7 +424,7 @@ def arm_with_dry_friction(y: float, yd: float, q: float, qd: float, f0: float, f
         return y1, yd1, q1, qd1
     reached = yd / (yd - yd1) if yd != yd1 else 1.0
     y1 = y + 0.5 * reached * c.h * yd
-    f = near_ground(f0 + reached * (f1 - f0), y1, e)
+    f = (f0 + reached * (f1 - f0)) * (1.0 + near_ground(y1, e))
     drive = arm_drive(math.sin(y1), y1, 0.0, f, w1, q1, qd1, gust, c, e)
     if abs(drive) <= limit:
         return y1, 0.0, q1, qd1
@@ -432,16 +455,16 @@ def advance_arm(state: State, wm: float, w1: float, c: Coefficients, e: Values |
                 ) -> tuple[float, float, float, float, float]:
     """Air and arm over one step, for the speed at 0 (in the state), h/2 and h: θ, θ̇, thrust, q, q̇."""
     w0, y, yd = state.omega, state.theta, state.theta_dot
-    fm, f1 = static_thrust(wm, c, e), static_thrust(w1, c, e)
     f0 = static_thrust(w0, c, e)
+    fm, f1 = static_thrust_near(wm, w0, f0, c, e), static_thrust_near(w1, w0, f0, c, e)
     if e is None:
         y, yd, _, _ = arm(y, yd, 0.0, 0.0, f0, fm, f1, w0, wm, w1, 0.0, 0.0, c, e, x)
         return y, yd, f1, 0.0, 0.0
     if e.thrust_lag_tau > 0.0:
-        f0 = state.thrust
         k = x.air
         a = 1.0 / e.thrust_lag_tau
-        s0, sm, s1 = a * static_thrust(w0, c, e), a * fm, a * f1
+        s0, sm, s1 = a * f0, a * fm, a * f1
+        f0 = state.thrust
         fm, f1 = (k.half_decay * f0 + k.u0 * s0 + k.u1 * sm + k.u2 * s1,
                   k.decay * f0 + k.w0 * s0 + k.w1 * sm + k.w2 * s1)
     q, qd = state.flex, state.flex_dot
@@ -514,7 +537,8 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0
     air = lag(1.0 / e.thrust_lag_tau if e.thrust_lag_tau > 0.0 else 0.0, h)
     gust_decay = math.exp(-period / e.gust_tau)
     return c, e, Extra(lag(1.0 / e.winding_heating_tau, h), air, n["R_a"], resistance, n["J_m"],
-                       gust_decay, e.gust_sigma * math.sqrt(1.0 - gust_decay**2), 1.0 / (1.0 - e.mast_flex_coupling))
+                       gust_decay, e.gust_sigma * math.sqrt(1.0 - gust_decay**2), 1.0 / (1.0 - e.mast_flex_coupling),
+                       1.0 / e.ground_effect_width)
 
 
 class Trajectory(NamedTuple):
