@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The main job with real processes: a plant with a hidden effect, recorded, diagnosed, and the answer put to use."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import psutil
+import pytest
+
+from aeropend_sim.parameters import load
+
+
+def demo(*arguments: object) -> subprocess.Popen[str]:
+    return subprocess.Popen([sys.executable, "-m", "aeropend_ident.demo", *map(str, arguments)],
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A demo that ran to its end."""
+    out = tmp_path_factory.mktemp("demo") / "results"
+    process = demo("--effect", "coulomb_friction", "--seed", 5, "--duration", 25, "--out", out)
+    said, complained = process.communicate(timeout=280)
+    return process.returncode, said, complained, out
+
+
+def test_the_hidden_effect_is_named(finished):
+    code, said, complained, out = finished
+    assert code == 0, said + complained
+    assert "verdict: coulomb_friction (arm)" in said
+    assert said.strip().endswith("the verdict is right")
+    body = json.loads((out / "diagnosis" / "diagnosis.json").read_text())
+    true = load(out / "rig.yaml").effects["coulomb_friction"]["accel"]
+    found = next(c for c in body["which"]["candidates"] if c["effect"] == "coulomb_friction")
+    assert found["parameters"]["accel"]["value"] == pytest.approx(true, rel=0.05)
+    assert body["shrink"]["closed"] > 0.9
+    assert body["notes"] == []
+
+
+def test_the_plant_runs_the_augmented_model(finished, start):
+    plant = start("plant", "--ros-args", "--params-file", str(finished[3] / "diagnosis" / "augmented.yaml"))
+    plant.wait_for("effects: coulomb_friction")
+
+
+def test_results_of_an_earlier_demo_stay(finished):
+    process = demo("--out", finished[3])
+    _, complained = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert len(complained.strip().splitlines()) == 1
+    assert "--out" in complained
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_demo_leaves_nothing_running(tmp_path, number):
+    process = demo("--duration", 60, "--out", tmp_path / "results")
+    end = time.monotonic() + 60.0
+    children: list[psutil.Process] = []
+    while len(children) < 3 and time.monotonic() < end:
+        children = psutil.Process(process.pid).children(recursive=True)
+        time.sleep(0.1)
+    assert len(children) == 3
+    process.send_signal(number)
+    _, complained = process.communicate(timeout=60)
+    assert process.returncode == 130, complained
+    assert "every process was stopped" in complained
+    assert not [c for c in children if c.is_running() and c.status() != psutil.STATUS_ZOMBIE]
+
+
+def test_a_wrong_effect_is_one_line():
+    process = demo("--effect", "friction")
+    _, complained = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert len(complained.strip().splitlines()) == 1
