@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The catalogue of effects that a nominal model can miss: one entry an effect.
 
-To add one: an entry here, its term in `actuator.py`, `dynamics.py` or `sensing.py`, and its row in the README.
+To add one: an entry here, its term in `actuator.py`, `dynamics.py` or `sensing.py`, and its row in docs/effects.md.
 """
 
 from __future__ import annotations
