@@ -17,7 +17,7 @@ import tempfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -388,7 +388,8 @@ def _read_sqlite(
             say(f"{file.name} was not closed: the recording was broken off, its last moments are lost")
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="aeropend-")))
             for other in (file, *beside):
-                shutil.copyfile(other, folder / other.name)
+                with suppress(FileNotFoundError):  # a journal goes when its writer is still alive
+                    shutil.copyfile(other, folder / other.name)
             file = folder / file.name
             _settle(file)
         try:
