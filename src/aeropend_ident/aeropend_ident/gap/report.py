@@ -214,15 +214,17 @@ def _verdict(doc: Any, candidates: Sequence[dict[str, Any]]) -> dict[str, Any]:
     found = sorted((c for c in candidates if c["found"]), key=lambda c: which["effects"].index(c["effect"]))
     lines = [_line(c, doc) for c in found]
     share = shrink["closed"]
-    ends = [] if shrink["low"] is None else list(dict.fromkeys((percent(shrink["low"]), percent(shrink["high"]))))
-    between = " to ".join(ends) if len(ends) > 1 else ""
+    between = ""
+    if shrink["low"] is not None and shrink["high"] - shrink["low"] > 1e-3:
+        between = f"{percent(shrink['low'])} to {percent(shrink['high'])}"
     held = f"the last {quantity(doc['held_out_s'][1] - doc['held_out_s'][0], 's', 2)} of the recording"
     if len(doc["bags"]) > 1:
         held = "the last part of each recording"
-    judged = (f"closes {percent(share)} of the gap{f' (95 % interval {between})' if between else ''} on {held}, "
-              "to which nothing was fitted")
     if share is None:
         judged = "has nothing to close: the gap is within the noise of the readings"
+    else:
+        judged = (f"closes {percent(share) if share > 0.0 else 'none'} of the gap"
+                  f"{f' (95 % interval {between})' if between else ''} on {held}, to which nothing was fitted")
     numbers = [(c["number"], PARAMETERS[f"model.{c['number']}"].description.partition(":")[0])
                for c in found if c["number"]]
     effects = [c["effect"] for c in found if not c["number"]]
@@ -398,7 +400,7 @@ def _held_out(s: Signals) -> slice:
 def _width(diagnosis: Diagnosis, k: int, doc: Any) -> float:
     """How wide the gap of recording k is: mean square over the channels, each over its gap in all recordings."""
     s, before = diagnosis.signals[k], diagnosis.before[k]
-    errors = [np.nanmean((before[c] - s.channel(c)) ** 2) / max(doc["channels"][c]["gap"], 1e-300) ** 2
+    errors = [np.nanmean(((before[c] - s.channel(c)) / max(doc["channels"][c]["gap"], 1e-12)) ** 2)
               for c in doc["channels"] if s.has(c)]
     return float(np.mean(errors)) if errors else 0.0
 

@@ -1,0 +1,337 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report of real diagnoses: what it says, that it stands alone, and that everybody can read it."""
+
+import base64
+import json
+import math
+from collections import Counter
+from dataclasses import replace
+from html.parser import HTMLParser
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from rigs import BENCH, recorded
+
+from aeropend_ident.diagnose import document
+from aeropend_ident.gap import report
+from aeropend_ident.gap.diagnosis import diagnose
+from aeropend_sim.effects import CATALOGUE, PLACES
+
+VOID = {"area", "base", "br", "col", "embed", "hr", "img", "input", "link", "meta", "source", "track", "wbr"}
+HOSTILE = "</script><script>alert('1')</script>\"><img src=x onerror=alert(2)>{{ 7 * 7 }}"
+
+
+class Page(HTMLParser):
+    """A page that is well formed: every tag is closed where it was opened."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.ids, self.texts, self.open = [], Counter(), [], []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        attributes = dict(attrs)
+        assert len(attributes) == len(attrs), f"{tag} with an attribute twice"
+        self.tags.append((tag, attributes, tuple(self.open)))
+        self.ids.update([attributes["id"]] if "id" in attributes else [])
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.texts.append((tuple(self.open), data))
+
+    def all(self, tag):
+        return [attributes for name, attributes, _ in self.tags if name == tag]
+
+    def text(self, *within):
+        """What a person reads inside all of these tags, with single plain spaces."""
+        shown = "".join(text for stack, text in self.texts
+                        if set(within) <= set(stack) and not {"script", "style"} & set(stack))
+        return " ".join(shown.split())
+
+    def data(self):
+        return [json.loads(text) for (stack, text), attributes in zip(
+            [t for t in self.texts if t[0][-1:] == ("script",)], self.all("script"), strict=True)
+            if attributes.get("type") == "application/json"]
+
+
+def rendered(diagnosis, bags=("my_bag",), model="bench", command="diagnose my_bag", **which):
+    made = document(diagnosis, list(bags), model, 2.5)
+    made["which"] = {**made["which"], **which}
+    return report.render(diagnosis, json.loads(json.dumps(made)), command)
+
+
+@pytest.fixture(scope="module")
+def friction():
+    """Diagnose 16 s of a rig with dry friction."""
+    return diagnose(BENCH, [recorded(11, {"coulomb_friction": {}}, duration=16.0)], 2)
+
+
+@pytest.fixture(scope="module")
+def nominal():
+    """Diagnose 15 s of a rig that lacks nothing."""
+    return diagnose(BENCH, [recorded(2, duration=15.0)], 2)
+
+
+@pytest.fixture(scope="module")
+def several():
+    """Diagnose 20 s of a rig with two effects."""
+    return diagnose(BENCH, [recorded(71, {"coulomb_friction": {}, "brush_drop": {}}, duration=20.0)], 2)
+
+
+@pytest.fixture(scope="module")
+def angle_only():
+    """Diagnose 15 s in which nothing but the angle was measured."""
+    return diagnose(BENCH, [recorded(95, {"coulomb_friction": {"accel": 1.5}}, 15.0, 0.005,
+                                     ("omega", "i_a", "v_a"))], 2)
+
+
+@pytest.fixture(scope="module")
+def two():
+    """Diagnose two recordings of one rig."""
+    return diagnose(BENCH, [recorded(12, {"coulomb_friction": {}}, duration=t) for t in (15.0, 18.0)], 2)
+
+
+@pytest.fixture(scope="module", params=["friction", "nominal", "several", "angle_only", "two"])
+def page(request):
+    diagnosis = request.getfixturevalue(request.param)
+    bags = [f"bag_{k}" for k in range(len(diagnosis.signals))]
+    return Page(rendered(diagnosis, bags))
+
+
+def test_needs_nothing_from_elsewhere(page):
+    for tag, attributes, _ in page.tags:
+        for name in ("src", "srcset", "data", "action", "poster", "xlink:href"):
+            assert name not in attributes, (tag, attributes)
+        assert attributes.get("href", "#").startswith(("#", "data:,")), (tag, attributes)
+    style = "".join(text for stack, text in page.texts if "style" in stack)
+    assert "{" in style
+    assert not [word for word in ("url(", "@import", "http:", "https:", "//") if word in style]
+    policy = [m["content"] for m in page.all("meta") if m.get("http-equiv") == "Content-Security-Policy"]
+    assert len(policy) == 1
+    assert policy[0].startswith("default-src 'none'")
+
+
+def test_everybody_can_read_it(page):
+    assert page.all("html") == [{"lang": "en"}]
+    assert "width=device-width" in next(m["content"] for m in page.all("meta") if m.get("name") == "viewport")
+    headings = [int(tag[1]) for tag, _, _ in page.tags if tag in {"h1", "h2", "h3", "h4"}]
+    assert headings.count(1) == 1
+    assert headings[0] == 1
+    assert all(b <= a + 1 for a, b in pairwise(headings))
+    pictures = page.all("svg")
+    assert len(pictures) > 20
+    for picture in pictures:
+        named = picture.get("role") == "img" and len(picture.get("aria-label", "")) > 10
+        assert named or picture.get("aria-hidden") == "true", picture
+    inside = [(stack, tag) for tag, _, stack in page.tags if tag in {"caption", "thead", "tbody"}]
+    assert Counter(tag for _, tag in inside) == dict.fromkeys(("caption", "thead", "tbody"), len(page.all("table")))
+    assert all(attributes.get("scope") in {"col", "row"} for attributes in page.all("th"))
+
+
+def test_what_is_referred_to_is_there(page):
+    assert set(page.ids.values()) == {1}
+    wanted = [a["aria-labelledby"] for _, a, _ in page.tags if "aria-labelledby" in a]
+    wanted += [a["href"][1:] for a in page.all("a")] + [a["data-traces"] for a in page.all("figure")]
+    assert set(wanted) <= set(page.ids)
+
+
+def test_traces_are_drawn_and_can_be_zoomed(page):
+    drawings = page.data()
+    assert drawings
+    paths = [a for a in page.all("path") if "data-series" in a]
+    assert len(paths) == sum(len(d["series"]) for d in drawings)
+    assert all(path["d"].startswith("M") for path in paths)
+    for drawing in drawings:
+        assert drawing["stop"] > drawing["start"]
+        lengths = {len(base64.b64decode(s["data"])) for s in drawing["series"]}
+        assert len(lengths) == 1
+        assert lengths.pop() > 2 * 1000
+
+
+def test_one_effect(friction):
+    page = Page(rendered(friction))
+    assert page.text("h1") == f"The model lacks coulomb_friction: {CATALOGUE['coulomb_friction'].physics}."
+    assert "closes" in page.text("header")
+    assert "accel 0.8" in page.text("header")
+    assert "rad/s²" in page.text("header")
+    assert page.text("title") == "coulomb_friction · diagnose"
+    for place in PLACES:
+        assert place in page.text("ol")
+    body = friction.body
+    assert report.percent(body["where"]["share"]["arm"]).replace("\N{NO-BREAK SPACE}", " ") in page.text("ol")
+    for row in body["channels"].values():
+        for key in ("gap", "gap_after", "floor"):
+            assert report.quantity(row[key], row["unit"]).replace("\N{NO-BREAK SPACE}", " ") in page.text("table")
+    for name in body["which"]["numbers"]:
+        assert name in page.text("table")
+
+
+def test_nothing_missing(nominal):
+    page = Page(rendered(nominal))
+    assert page.text("h1") == "The model lacks nothing that this recording shows."
+    assert page.text("title") == "nothing missing · diagnose"
+    assert "found" not in page.text("table", "span")
+
+
+def test_several_effects(several):
+    assert set(several.body["which"]["effects"]) == {"coulomb_friction", "brush_drop"}
+    page = Page(rendered(several))
+    first, second = several.body["which"]["effects"]
+    assert page.text("h1") == f"The model lacks 2 effects: {first} and {second}."
+    for effect in (first, second):
+        assert CATALOGUE[effect].physics in page.text("header")
+    assert page.text("table", "span").count("found") == 2
+
+
+def test_unknown(friction):
+    page = Page(rendered(friction, verdict="unknown", effects=[], unexplained=["theta is off by 9.1 times the noise"]))
+    assert page.text("h1") == ("The model lacks something that the catalogue does not hold, "
+                               "in this part of the chain: arm.")
+    assert "theta is off by 9.1 times the noise" in page.text("header")
+    assert page.text("title") == "unknown effect · diagnose"
+
+
+def test_a_number_that_is_off(friction):
+    refitted = friction.body["which"]["numbers"]["R_a"]["value"]
+    rows = [{"effect": "parameter_mismatch", "place": "electrical", "probability": p, "gap_after": 0.1,
+             "parameters": {"R_a": {"value": value, "low": 1.0, "high": 2.0}}}
+            for p, value in ((0.9, refitted), (0.1, 7.0))]
+    page = Page(rendered(friction, verdict="parameter_mismatch", effects=["parameter_mismatch"], candidates=rows))
+    assert page.text("h1") == "The structure of the model is right, but R_a (armature resistance) is off."
+    assert "nominal 1.08 Ω" in page.text("header")
+    assert page.text("table", "span").count("found") == 1
+
+
+def test_effects_and_a_number_together(friction):
+    rows = [r for r in friction.body["which"]["candidates"] if r["effect"] == "coulomb_friction"]
+    value = friction.body["which"]["numbers"]["J_m"]["value"]
+    rows += [{"effect": "parameter_mismatch", "place": "rotor", "probability": 1.0, "gap_after": 0.1,
+              "parameters": {"J_m": {"value": value, "low": 0.9 * value, "high": 1.1 * value}}}]
+    page = Page(rendered(friction, effects=["coulomb_friction", "parameter_mismatch"], candidates=rows))
+    assert page.text("h1") == "The model lacks coulomb_friction, and J_m is off."
+
+
+def test_what_is_open(friction):
+    advice = {"why": "slow ramps tell them apart", "excite": {"kind": "steps", "duration": 60, "sequence": [0.1, 0.2]}}
+    page = Page(rendered(friction, not_separable=[["coulomb_friction", "quadratic_drag"]], next_experiment=advice))
+    assert "This recording cannot tell coulomb_friction from quadratic_drag." in page.text("main")
+    assert "slow ramps tell them apart" in page.text("main")
+    assert page.text("main", "pre") == "excite --ros-args -p kind:=steps -p duration:=60 -p 'sequence:=[0.1, 0.2]'"
+    assert "cannot tell" not in Page(rendered(friction, not_separable=[], next_experiment=None)).text("main")
+
+
+def test_a_number_that_moved_is_marked(friction):
+    numbers = friction.body["which"]["numbers"]
+    moved = {"R_a": {"nominal": 1.0, "value": 1.2, "low": 1.1, "high": 1.3},
+             "L_a": {"nominal": 1.0, "value": 0.96, "low": 0.95, "high": 0.97}}
+    page = Page(rendered(friction, numbers={**numbers, **moved}))
+    marked = [text for stack, text in page.texts if stack[-2:] == ("td", "span")]
+    assert "+20\N{NO-BREAK SPACE}%" in marked
+    off = [a for tag, a, stack in page.tags if a.get("class") == "off"]
+    assert len(off) == 1 + sum(abs(n["value"] / n["nominal"] - 1.0) > report.OFF
+                               for name, n in numbers.items() if name not in moved)
+
+
+def test_missing_channels_are_said(angle_only):
+    page = Page(rendered(angle_only))
+    assert "nothing is known of it: rotor speed, armature current, armature voltage." in page.text("main")
+    assert len(page.data()[0]["series"]) == 1 + 3 + 2
+
+
+def test_several_recordings_are_told_apart(two):
+    page = Page(rendered(two, ["monday", "tuesday"]))
+    assert page.text("figcaption") == "mondaytuesday"
+    assert len(page.data()) == 2
+    assert "the last part of each recording" in page.text("header")
+
+
+def test_names_cannot_inject(friction):
+    signals = [replace(friction.signals[0], notes=(HOSTILE,))]
+    text = rendered(replace(friction, signals=signals), [HOSTILE], HOSTILE, f"diagnose {HOSTILE}",
+                    unexplained=[HOSTILE], next_experiment={"why": HOSTILE, "excite": {HOSTILE: HOSTILE}})
+    page, harmless = Page(text), Page(rendered(friction, next_experiment={"why": "", "excite": {"a": "b"}}))
+    assert len(page.all("script")) == len(harmless.all("script")) == 2
+    assert page.all("img") == []
+    assert page.text("body").count(HOSTILE) >= 6
+    assert not [a for _, a, _ in page.tags if any(name.startswith("on") for name in a)]
+
+
+def test_a_long_recording_stays_small(friction):
+    rng = np.random.default_rng(0)
+    n = 100_000
+    one = friction.signals[0]
+    noise = {c: rng.standard_normal(n) for c in ("theta", "omega", "i_a", "v_a")}
+    long = replace(one, duty=rng.random(n), train=30_000, **noise)
+    far = [{c: x + rng.standard_normal(n) for c, x in noise.items()}] * 5
+    text = rendered(replace(friction, signals=[long] * 5, before=far, after=far), list("abcde"))
+    assert len(text.encode()) < 1_500_000
+    assert "Shown are the 4 recordings with the widest gap." in Page(text).text("main")
+
+
+@pytest.mark.parametrize(("value", "unit", "text"), [
+    (0.032041, "rad", "0.0320 rad"), (3.0501, "rad/s", "3.05 rad/s"), (1.7823e-5, "kg·m²", "1.78 × 10⁻⁵ kg·m²"),
+    (-12345.6, "", "−12300"), (0.0, "A", "0.00 A"), (2.0, "-", "2.00"), (None, "A", "–"), (math.nan, "A", "–"),
+])
+def test_quantities(value, unit, text):
+    assert report.quantity(value, unit).replace("\N{NO-BREAK SPACE}", " ") == text
+
+
+@pytest.mark.parametrize(("numbers", "texts"), [
+    ((0.79937, 0.79810, 0.80065), ("0.7994", "0.7981 to 0.8006")),
+    ((1.7823e-5, 1.6815e-5, 1.8831e-5), ("1.78 × 10⁻⁵", "1.68 to 1.88 × 10⁻⁵")),
+    ((45142.4, 42099.0, 48186.0), ("45100", "42100 to 48200")),
+    ((0.0, -0.0286, 0.0286), ("0.000", "−0.029 to 0.029")),
+    ((2.0, 2.0, 2.0), ("2.000", "2.000 to 2.000")),
+    ((1.0, math.nan, math.inf), ("1.00", "– to –")),
+])
+def test_intervals(numbers, texts):
+    assert tuple(t.replace("\N{NO-BREAK SPACE}", " ") for t in report.interval(*numbers)) == texts
+
+
+@pytest.mark.parametrize(("share", "text"), [
+    (1.0, "100 %"), (0.9996, "> 99.9 %"), (0.994, "99.4 %"), (0.636, "64 %"), (0.0712, "7.1 %"), (0.0004, "< 0.1 %"),
+    (0.0, "0 %"), (-0.2, "−20 %"), (None, "–"),
+])
+def test_percents(share, text):
+    assert report.percent(share).replace("\N{NO-BREAK SPACE}", " ") == text
+
+
+def test_no_probability_is_certain():
+    assert report.probability(1.0).startswith(">")
+    assert report.probability(0.0).startswith("<")
+
+
+def test_every_stretch_keeps_its_least_and_greatest():
+    x = np.random.default_rng(1).standard_normal(10_007)
+    x[[500, 5000]] = 99.0, -99.0
+    x[2000:3000] = np.nan
+    drawn = report._least_and_greatest(x, 400)
+    assert len(drawn) == 400
+    assert (np.nanmax(drawn), np.nanmin(drawn)) == (99.0, -99.0)
+    assert 30 <= np.isnan(drawn).sum() <= 40
+    assert report._least_and_greatest(x, 20_000) is x
+
+
+def test_packed_values_come_back():
+    x = np.concatenate([np.linspace(-3.0, 5.0, 1001), [np.nan]])
+    packed = report._packed(x)
+    steps = np.frombuffer(base64.b64decode(packed["data"]), "<i2").astype(float)
+    back = np.where(steps == -32768, np.nan, packed["low"] + (steps + 32767) * packed["scale"])
+    assert np.nanmax(np.abs(back - x)) <= 8.0 / 65534 / 2 * 1.001
+    assert np.isnan(back[-1])
+    assert not np.isnan(back[:-1]).any()
+
+
+def test_a_path_has_gaps_where_values_are_missing():
+    assert report._path(np.array([0.0, 1.0, np.nan, 1.0, 0.0]), 0.0, 1.0) == "M0 400l0 0 400-400M1200 0l0 0 400 400"
