@@ -35,6 +35,10 @@ PLACE_OF_NUMBER = {
 """Where in the chain a number of the model lives."""
 
 
+RAN_AWAY = 1e9
+"""What the difference to a simulation that is not finite counts as."""
+
+
 def with_values(model: Model, values: Values) -> Model:
     """The model with these values: `R_a` is a number, `coulomb_friction.accel` an effect's; `initial.*` is left out."""
     numbers = dict(model.model)
@@ -83,7 +87,7 @@ class Chain:
     def actuator_residuals(self, values: Values) -> dict[str, Array]:
         """Residual of the voltage over the training part, in units of its noise."""
         s = self.signals
-        return {"v_a": self._train(s.v_a - self.actuator(values), s.after_unseen) / s.sigma["v_a"]}
+        return {"v_a": self._train(s.v_a, self.actuator(values), s.after_unseen) / s.sigma["v_a"]}
 
     def feed_motor(self, values: Values) -> None:
         """Take the voltage that feeds the motor from the measured one, described by the actuator with these values."""
@@ -118,13 +122,13 @@ class Chain:
             m = with_values(self.model, values).effects
             gain = 1.0 + m.get("current_gain", {}).get("gain", 0.0)
             offset = m.get("current_offset", {}).get("bias", 0.0)
-            residuals["i_a"] = self._train(s.i_a - gain * i_a - offset) / s.sigma["i_a"]
+            residuals["i_a"] = self._train(s.i_a, gain * i_a + offset) / s.sigma["i_a"]
         if s.pulses is not None:
             p = s.pulses
             use = (p.index < s.train) & ~p.false
             residuals["omega"] = ((p.omega - mean_speed(angle, p.time, p.period, s.period)) / p.sigma)[use]
         elif s.has("omega"):
-            residuals["omega"] = self._train(robust(s.omega - omega, s.sigma["omega"])) / s.sigma["omega"]
+            residuals["omega"] = self._train(s.true_speed, omega) / s.sigma["omega"]
         return residuals
 
     def feed_arm(self, values: Values) -> None:
@@ -137,8 +141,7 @@ class Chain:
             middle = (p.time - 0.5 * p.period)[~p.false]
             omega = omega + np.interp(np.arange(len(s)) * s.period, middle, error)
         elif s.has("omega"):
-            error = robust(s.omega - omega, s.sigma["omega"])
-            omega = omega + smooth(error, round(0.02 / s.period))
+            omega = omega + smooth(s.true_speed - omega, round(0.02 / s.period))
         self.speed = np.maximum(omega, 0.0)
 
     # --- arm: speed -> angle
@@ -156,15 +159,15 @@ class Chain:
 
     def arm_residuals(self, values: Values) -> dict[str, Array]:
         """Residual of the angle over the training part, in units of its noise."""
-        return {"theta": self._train(self.signals.theta - self.arm(values)) / self.signals.sigma["theta"]}
+        return {"theta": self._train(self.signals.theta, self.arm(values)) / self.signals.sigma["theta"]}
 
     def residuals(self, block: str) -> Callable[[Values], dict[str, Array]]:
         """The residual function of a block by name."""
         return {"actuator": self.actuator_residuals, "motor": self.motor_residuals, "arm": self.arm_residuals}[block]
 
-    def _train(self, x: Array, start: int = 0) -> Array:
-        x = x[start:self.signals.train]
-        return x[np.isfinite(x)]
+    def _train(self, measured: Array, simulated: Array, start: int = 0) -> Array:
+        part = slice(start, self.signals.train)
+        return difference(measured[part], simulated[part])
 
 
 class Chains:
@@ -217,13 +220,10 @@ def smooth(x: Array, width: int) -> Array:
     return np.where(count > 0.0, total / np.maximum(count, 1.0), 0.0)
 
 
-def robust(error: Array, sigma: float) -> Array:
-    """The error with single outliers (far from the median of their neighbours) marked as missing."""
-    if len(error) < 7:
-        return error
-    window = np.lib.stride_tricks.sliding_window_view(np.pad(error, 3, mode="edge"), 7)
-    away = np.abs(error - np.nanmedian(window, axis=1))
-    return np.where(away > max(8.0 * sigma, 1e-9), np.nan, error)
+def difference(measured: Array, simulated: Array) -> Array:
+    """Measured minus simulated where something was measured; a simulation that ran away counts as far off."""
+    known = np.isfinite(measured)
+    return np.nan_to_num(measured[known] - simulated[known], nan=RAN_AWAY, posinf=RAN_AWAY, neginf=-RAN_AWAY)
 
 
 def mean_speed(angle: Array, time: Array, length: Array, period: float) -> Array:

@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from aeropend_ident.gap import gust as gusts
 from aeropend_ident.gap import shrink, where
-from aeropend_ident.gap.chain import BLOCKS, PLACE_OF_NUMBER, Chains, with_values
+from aeropend_ident.gap.chain import BLOCKS, PLACE_OF_NUMBER, Chains, difference, with_values
 from aeropend_ident.gap.experiment import next_experiment
 from aeropend_ident.gap.fit import Fit, Unknown, fit
 from aeropend_ident.gap.signals import CHANNELS, Signals
@@ -163,7 +163,7 @@ class _Scorer:
 
     def gap(self, readings: Sequence[Mapping[str, Array]], known: bool = True) -> shrink.Gap:
         """The gap over all recordings; `known`: false periods of the speed are told apart if they were found."""
-        gaps = [shrink.gap(r, s, s.train, len(s), _false(s) if known and self.spikes else None)
+        gaps = [shrink.gap(r, s, s.train, len(s), s.false_speed if known and self.spikes else None)
                 for r, s in zip(readings, self.recordings, strict=True)]
         if len(gaps) == 1:
             return gaps[0]
@@ -194,27 +194,11 @@ class _Scorer:
         return math.sqrt(float(np.mean([(floors[c] / gap.spread[c]) ** 2 for c in gap.rms])))
 
 
-def _false(s: Signals) -> NDArray[np.bool_]:
-    """Samples (N,) at which a false period is held, or a single speed stands out."""
-    out = np.zeros(len(s), dtype=bool)
-    p = s.pulses
-    if p is not None:
-        ends = np.append(p.index[1:], len(s))
-        for a, b in zip(p.index[p.false], ends[p.false], strict=True):
-            out[a:b] = True
-    elif s.has("omega"):
-        from aeropend_ident.gap.chain import robust
-
-        out = np.isfinite(s.omega) & np.isnan(robust(s.omega, s.sigma["omega"]))
-    return out
-
-
 def _spikes(recordings: Sequence[Signals]) -> Weighed | None:
     """Whether false speed periods come more often than any rig may show."""
     count, time = 0, 0.0
     for s in recordings:
-        flags = _false(s)
-        count += int(np.sum(np.diff(flags[: s.train].astype(int)) == 1))
+        count += int(np.sum(np.diff(s.false_speed[: s.train].astype(int)) == 1))
         time += s.train * s.period
     if count < 3:
         return None
@@ -318,16 +302,16 @@ def _joint(chains: Chains, findings: Mapping[str, Findings]) -> tuple[dict[str, 
             readings = shrink.free_run(chains.model, s, chains.own(values, k))
             suffix = f"@{k}" if k else ""
             for channel in ("theta", "i_a", "v_a"):
-                e = (s.channel(channel) - readings[channel])[s.after_unseen if channel == "v_a" else 0:s.train]
-                out[channel + suffix] = e[np.isfinite(e)] / s.sigma[channel]
+                part = slice(s.after_unseen if channel == "v_a" else 0, s.train)
+                out[channel + suffix] = difference(s.channel(channel)[part], readings[channel][part]) / s.sigma[channel]
             p = s.pulses
             if p is not None:
                 use = p.index[(p.index < s.train) & ~p.false]
                 sigma = p.sigma[(p.index < s.train) & ~p.false]
                 out["omega" + suffix] = (s.omega[use] - readings["omega"][use]) / sigma
             elif s.has("omega"):
-                e = np.where(_false(s), np.nan, s.omega - readings["omega"])[: s.train]
-                out["omega" + suffix] = e[np.isfinite(e)] / s.sigma["omega"]
+                speed = difference(s.true_speed[: s.train], readings["omega"][: s.train])
+                out["omega" + suffix] = speed / s.sigma["omega"]
         return out
 
     begun = [Unknown(u.name, u.mean, u.sd, u.low, u.high, start.get(u.name, u.start), u.log)

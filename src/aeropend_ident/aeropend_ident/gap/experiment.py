@@ -56,7 +56,7 @@ def _difference(model: Model, signals: Signals, first: Mapping[str, float], seco
     duty = excitation.series()
     nothing = np.full(len(duty), np.nan)
     planned = replace(signals, period=SAMPLE_PERIOD, duty=duty, theta=nothing, omega=nothing, i_a=nothing, v_a=nothing,
-                      pulses=None, train=len(duty))
+                      pulses=None, false_speed=np.zeros(len(duty), dtype=bool), train=len(duty))
     a, b = (free_run(model, planned, {k: v for k, v in values.items() if not k.startswith("initial.")})
             for values in (first, second))
     noise = {**signals.sigma, "omega": max(signals.sigma["omega"], 0.1)}

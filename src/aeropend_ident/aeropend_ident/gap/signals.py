@@ -58,6 +58,7 @@ class Signals:
         theta, omega, i_a, v_a: (N,) measured, NaN where missing.
         sigma: channel -> standard deviation of a reading (noise and quantisation).
         pulses: the intervals behind omega, or None where the speed is sampled directly or not at all.
+        false_speed: (N,) where omega is known to be false: a false period, or a sample that stands alone.
         train: number of samples that models are fitted to; the rest is held out.
         notes: what a person should know about the data.
     """
@@ -70,6 +71,7 @@ class Signals:
     v_a: Array
     sigma: Mapping[str, float]
     pulses: Pulses | None
+    false_speed: NDArray[np.bool_]
     train: int
     notes: tuple[str, ...] = ()
 
@@ -84,6 +86,11 @@ class Signals:
     def channel(self, name: str) -> Array:
         """A measured channel by name, (N,)."""
         return np.asarray(getattr(self, name))
+
+    @property
+    def true_speed(self) -> Array:
+        """The speed (N,) with what is known to be false taken out (NaN)."""
+        return np.where(self.false_speed, np.nan, self.omega)
 
     def has(self, name: str) -> bool:
         """Whether a channel was measured at all."""
@@ -137,8 +144,9 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
         stated = math.hypot(sensing[f"{key}_noise"], sensing[f"{key}_lsb"] / math.sqrt(12.0))
         seen = _noise_of(columns[channel])
         sigma[channel] = seen if seen > 2.0 * stated else stated  # quantisation spoils what is seen of a small noise
+    false_speed = _held_false(pulses, n) if pulses else _outliers(columns["omega"], sigma["omega"])
     return Signals(period, duty, columns["theta"], columns["omega"], columns["i_a"], columns["v_a"], sigma, pulses,
-                   train, notes)
+                   false_speed, train, notes)
 
 
 def _held(x: Array) -> Array:
@@ -148,11 +156,35 @@ def _held(x: Array) -> Array:
 
 
 def _noise_of(x: Array) -> float:
-    """White noise of a channel from its second differences, robust against steps; a millionth of its range at least."""
+    """White noise of a channel from its second differences, robust against steps, and from its resolution."""
     x = x[np.isfinite(x)]
     if len(x) < 10:
         return 1e-6
-    return max(float(np.median(np.abs(np.diff(x, 2)))) / 0.6745 / math.sqrt(6.0), 1e-6 * float(np.ptp(x)), 1e-9)
+    levels = np.unique(x)
+    resolution = float(np.median(np.diff(levels))) if 1 < len(levels) < len(x) / 10 else 0.0
+    white = float(np.median(np.abs(np.diff(x, 2)))) / 0.6745 / math.sqrt(6.0)
+    return max(white, resolution / math.sqrt(12.0), 1e-6 * float(np.ptp(x)), 1e-9)
+
+
+def _held_false(pulses: Pulses, n: int) -> NDArray[np.bool_]:
+    """The samples (n,) at which a false period is held."""
+    out = np.zeros(n, dtype=bool)
+    ends = np.append(pulses.index[1:], n)
+    for a, b in zip(pulses.index[pulses.false], ends[pulses.false], strict=True):
+        out[a:b] = True
+    return out
+
+
+def _outliers(x: Array, sigma: float) -> NDArray[np.bool_]:
+    """Samples (N,) that stand alone: far from the median of their neighbours, which agree with each other."""
+    if len(x) < 7:
+        return np.zeros(len(x), dtype=bool)
+    window = np.lib.stride_tricks.sliding_window_view(np.pad(x, 3, mode="edge"), 7)
+    known = np.isfinite(window).sum(axis=1) >= 4
+    median, spread = np.zeros(len(x)), np.zeros(len(x))
+    median[known] = np.nanmedian(window[known], axis=1)
+    spread[known] = np.nanmedian(np.abs(window[known] - median[known, None]), axis=1)
+    return known & (np.abs(x - median) > 8.0 * (sigma + spread) + 0.1 * np.abs(median))
 
 
 def find_pulses(omega: Array, period: float, sensing: Mapping[str, float]) -> Pulses:
