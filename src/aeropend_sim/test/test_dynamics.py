@@ -198,6 +198,31 @@ def test_effect_meets_scipy(id_, size):
         assert found[[0, 1, 3]].max() < (2e-4 if size == "default" else 2e-3)
 
 
+def test_voltage_is_that_at_the_terminals():
+    sag = {"supply_sag": {"r_supply": 0.5}}
+    duty = duty_for(SAMPLE_PERIOD)
+    found = simulate(load("bench").with_effects(sag), duty)
+    assert found.v_a == pytest.approx(actuator.voltage(load("bench").model, duty) - 0.5 * found.i_a, abs=1e-12)
+
+
+@pytest.mark.parametrize("id_", ["thrust_lag", "thrust_exponent"])
+def test_thrust_meets_scipy(id_):
+    model, duty = load("bench").with_effects(defaults(id_)), duty_for(SAMPLE_PERIOD)
+    reference = Reference(model)
+    expected = reference.run(duty, SAMPLE_PERIOD)
+    thrust = expected[4] if id_ == "thrust_lag" else [reference.static(omega) for omega in expected[3]]
+    assert np.abs(simulate(model, duty).thrust - thrust).max() < 2e-5 * np.ptp(thrust)
+
+
+@pytest.mark.parametrize("period", [SAMPLE_PERIOD, 20e-3])
+def test_rotor_angle_is_the_integral_of_the_speed(period):
+    duty, fine = duty_for(period), 32
+    found = simulate(load("bench"), duty, period)
+    omega = simulate(load("bench"), np.repeat(duty, fine), period / fine).omega
+    turned = np.concatenate([[0.0], np.cumsum(0.5 * (omega[1:] + omega[:-1])) * period / fine])[::fine]
+    assert found.rotor_angle == pytest.approx(turned, abs=2e-5 * turned[-1])
+
+
 SMOOTH = [id_ for id_ in EQUATIONS
           if id_ not in ("command_delay", "brush_drop", "rotor_friction", "coulomb_friction", "gust")]
 
