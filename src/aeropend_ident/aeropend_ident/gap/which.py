@@ -216,14 +216,14 @@ def _search_block(chains: Chains, block: str, candidates: list[Hypothesis], wher
     for other in {b for h in candidates for b in where[h.name] if b != block}:
         downstream[other] = fit(chains.residuals(other), [*initial_unknowns(chains, other),
                                                          *number_unknowns(chains, other)])
+    nominal = known
     while len(findings.found) < MOST_EFFECTS:
         current = findings.final
         open_ = [h for h in candidates if h.name not in {g.name for g in findings.effects}]
         chosen = _shortlist(chains, block, open_, known, current)
         work = [pool.submit(_try, chains, block, h, start, known, current, downstream, where[h.name])
                 for h, start in chosen]
-        fits = [w.result() for w in work]
-        rivals = _weigh(block, [h for h, _ in chosen], fits, current, downstream, where)
+        rivals = _weigh(block, [h for h, _ in chosen], [w.result() for w in work], current, downstream, where)
         if not rivals:
             break
         best = rivals[0]
@@ -234,7 +234,28 @@ def _search_block(chains: Chains, block: str, candidates: list[Hypothesis], wher
         known = _adopt(known, best.hypothesis)
         findings.final = best.fit if set(best.fit.residuals) == set(base.residuals) else fit(
             chains.residuals(block), _started(known, best.fit.values))
+    _prune(chains, findings, nominal)
     return findings
+
+
+def _prune(chains: Chains, findings: Findings, nominal: list[Unknown]) -> None:
+    """Take out again what was found first and is not needed beside what was found later, the least needed first."""
+    while len(findings.found) > 1:
+        without = []
+        for round_ in findings.found:
+            known = nominal
+            for h in findings.effects:
+                if h is not round_[0].hypothesis:
+                    known = _adopt(known, h)
+            f = fit(chains.residuals(findings.block), _started(known, findings.final.values))
+            counts = {c: max(n, f.independent[c]) for c, n in findings.final.independent.items()}
+            gain = findings.final.evidence(counts) - f.evidence(counts) + _log_odds(round_[0].hypothesis)
+            without.append((gain, round_, f))
+        gain, round_, f = min(without, key=lambda w: w[0])
+        if gain > 0.0:
+            break
+        findings.found.remove(round_)
+        findings.final = f
 
 
 def _shortlist(chains: Chains, block: str, candidates: list[Hypothesis], known: list[Unknown], current: Fit
@@ -292,13 +313,17 @@ def _weigh(block: str, open_: list[Hypothesis], fits: list[Fit], current: Fit, d
             independent[channel] = max(mine, other)
         gain = f.evidence(independent) - current.evidence(independent_for(current, independent))
         gain -= sum(g.evidence(independent_for(g, independent)) for g in rest.values())
-        shared = sum(map(len, BLOCKS.values())) if h.number else 1
-        gains.append(gain + math.log(EFFECT_ODDS / shared))
+        gains.append(gain + _log_odds(h))
     weights = np.array([*gains, 0.0])
     weights = np.exp(weights - weights.max())
     probability = weights / weights.sum()
     weighed = [Weighed(h, f, g, float(p)) for h, f, g, p in zip(open_, fits, gains, probability, strict=False)]
     return sorted(weighed, key=lambda w: -w.gain)
+
+
+def _log_odds(hypothesis: Hypothesis) -> float:
+    """Prior log odds of a hypothesis against none further."""
+    return math.log(EFFECT_ODDS / (sum(map(len, BLOCKS.values())) if hypothesis.number else 1))
 
 
 def independent_for(f: Fit, counts: Mapping[str, float]) -> dict[str, float]:
