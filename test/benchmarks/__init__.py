@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `make bench` measures: each figure beside its peer, both in the same run."""

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the benchmark measures, and what a figure is."""
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+
+class NotMeasuredError(Exception):
+    """A figure cannot be measured here; the message is one line that says why."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Repeated measurements of one number."""
+
+    median: float
+    q1: float
+    q3: float
+    low: float
+    high: float
+    repeats: int
+
+    @classmethod
+    def of(cls, values: Sequence[float] | np.ndarray | float) -> "Spread":
+        """Sum up values; a single number is a measurement made once."""
+        values = np.atleast_1d(np.asarray(values, dtype=float))
+        low, q1, median, q3, high = np.percentile(values, (0, 25, 50, 75, 100)).tolist()
+        return cls(median, q1, q3, low, high, len(values))
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a figure must reach: its own median, or that of its ratio to the peer."""
+
+    limit: float
+    of: str = "ours"
+    at_least: bool = False
+
+    def __str__(self) -> str:
+        sign = "≥" if self.at_least else "≤"
+        return f"{sign} {self.limit:,g}" + (" x peer" if self.of == "ratio" else "")
+
+
+@dataclass
+class Figure:
+    """One line of the table.
+
+    Attributes:
+        name: what is measured.
+        unit: of ours and peer.
+        ours: our program.
+        target: what it must reach, if that is agreed.
+        peer_name: whom it is compared with.
+        peer: the peer, in the same run.
+        ratio: ours over peer, pair by pair.
+        details: further numbers for the JSON file.
+        note: one line below the table.
+        load: processes that wanted a core when the measurement began (1-minute average).
+    """
+
+    name: str
+    unit: str
+    ours: Spread
+    target: Target | None = None
+    peer_name: str = ""
+    peer: Spread | None = None
+    ratio: Spread | None = None
+    details: dict[str, Any] = field(default_factory=dict)
+    note: str = ""
+    load: float = 0.0
+
+    @property
+    def met(self) -> bool | None:
+        """Whether the target is reached; None without one."""
+        if self.target is None:
+            return None
+        judged = self.ratio if self.target.of == "ratio" else self.ours
+        assert judged is not None
+        if self.target.at_least:
+            return judged.median >= self.target.limit
+        return judged.median <= self.target.limit
+
+
+def interleaved(repeats: int, *functions: Callable[[], Any], clock: Callable[[], float] = time.thread_time
+                ) -> list[np.ndarray]:
+    """Time functions in turn, so that whatever disturbs the machine disturbs all: (repeats,) s for each.
+
+    The default clock counts this thread's CPU time; give `time.perf_counter` for what runs in several threads.
+    """
+    for function in functions:
+        function()
+    seconds = np.empty((len(functions), repeats))
+    for k in range(repeats):
+        for j, function in enumerate(functions):
+            start = clock()
+            function()
+            seconds[j, k] = clock() - start
+    return list(seconds)
+
+
+def load() -> float:
+    """Return the 1-minute load average."""
+    return os.getloadavg()[0]

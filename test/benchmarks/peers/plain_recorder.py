@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What most people write: decoded subscriptions, spun by rclpy.spin, into rosbags' Writer."""
+
+import sys
+import time
+from functools import partial
+from typing import Any
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.serialization import serialize_message
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from sensor_msgs.msg import BatteryState, JointState
+from std_msgs.msg import Float64
+
+from aeropend_sim import interface
+
+TOPICS = {interface.JOINT_STATES: JointState, interface.ARMATURE: BatteryState, interface.DUTY_COMMAND: Float64}
+
+
+class PlainRecorder(Node):
+    """Records three topics."""
+
+    def __init__(self, writer: Writer) -> None:
+        super().__init__("plain_recorder")
+        self._writer = writer
+        typestore = get_typestore(Stores.ROS2_JAZZY)
+        for topic, kind in TOPICS.items():
+            name = f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
+            connection = writer.add_connection(f"/{topic}", name, typestore=typestore)
+            self.create_subscription(kind, topic, partial(self._write, connection), interface.QOS)
+
+    def _write(self, connection: Any, message: Any) -> None:
+        self._writer.write(connection, time.time_ns(), serialize_message(message))
+
+
+if __name__ == "__main__":
+    rclpy.init()
+    with Writer(sys.argv[1], version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        try:
+            rclpy.spin(PlainRecorder(writer))
+        except (KeyboardInterrupt, ExternalShutdownException):
+            rclpy.try_shutdown()
