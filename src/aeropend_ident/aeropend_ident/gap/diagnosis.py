@@ -53,7 +53,7 @@ class Diagnosis:
         model: the nominal model. augmented: with refitted numbers and found effects.
         signals: the recordings. before, after: channel -> (N,) free-run readings, per recording.
         body: the content of `diagnosis.json` from `channels` on (contract section 5).
-        residuals: series for the report, name -> (M,).
+        misfit: what the nominal structure leaves where it fits worst, and the variables beside it, name -> (M,).
     """
 
     model: Model

@@ -210,5 +210,5 @@ def find_pulses(omega: Array, period: float, sensing: Mapping[str, float]) -> Pu
     time = (at - 0.5) * period
     slope = np.gradient(speed, time) if len(at) > 2 else np.zeros(len(at))
     tick = np.maximum(sensing["speed_tick"], 1e-6) * speed / np.maximum(length, 1e-9) if len(at) else np.zeros(0)
-    sigma = np.sqrt(tick**2 + sensing["speed_noise"] ** 2 + (0.3 * period * slope) ** 2 + 1e-6 * speed**2)
+    sigma = np.sqrt(tick**2 + sensing["speed_noise"] ** 2 + (0.4 * period * slope) ** 2 + (2e-4 * speed) ** 2)
     return Pulses(at, time, length, speed, sigma, false)

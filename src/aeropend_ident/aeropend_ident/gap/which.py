@@ -223,9 +223,17 @@ def _search_block(chains: Chains, block: str, candidates: list[Hypothesis], wher
         chosen = _shortlist(chains, block, open_, known, current)
         work = [pool.submit(_try, chains, block, h, start, known, current, downstream, where[h.name])
                 for h, start in chosen]
-        rivals = _weigh(block, [h for h, _ in chosen], [w.result() for w in work], current, downstream, where)
+        tried = [(h, w.result()) for (h, _), w in zip(chosen, work, strict=True)]
+        rivals = _weigh(block, tried, current, downstream, where)
         if not rivals:
             break
+        # the numbers that a rival was led to may serve as well without it
+        again = fit(chains.residuals(block), _started(known, rivals[0].fit.values))
+        counts = _counts([current, again])
+        if again.evidence(counts) > current.evidence(counts) + 1.0:
+            current = findings.final = again
+            findings.base = findings.base if findings.found else again
+            rivals = _weigh(block, tried, current, downstream, where)
         best = rivals[0]
         if best.probability < 0.5 or not (best.hypothesis.number or _material(current, best.fit)):
             findings.rivals = rivals
@@ -248,7 +256,7 @@ def _prune(chains: Chains, findings: Findings, nominal: list[Unknown]) -> None:
                 if h is not round_[0].hypothesis:
                     known = _adopt(known, h)
             f = fit(chains.residuals(findings.block), _started(known, findings.final.values))
-            counts = {c: max(n, f.independent[c]) for c, n in findings.final.independent.items()}
+            counts = _counts([findings.final, f])
             gain = findings.final.evidence(counts) - f.evidence(counts) + _log_odds(round_[0].hypothesis)
             without.append((gain, round_, f))
         gain, round_, f = min(without, key=lambda w: w[0])
@@ -297,38 +305,33 @@ def _try(chains: Chains, block: str, hypothesis: Hypothesis, start: int, known: 
     return fit(residuals, _adopt(unknowns, hypothesis, start))
 
 
-def _weigh(block: str, open_: list[Hypothesis], fits: list[Fit], current: Fit, downstream: Mapping[str, Fit],
+def _weigh(block: str, tried: list[tuple[Hypothesis, Fit]], current: Fit, downstream: Mapping[str, Fit],
            where: Mapping[str, tuple[str, ...]]) -> list[Weighed]:
     """Log evidence of each against none further, and probabilities; best first."""
-    if not open_:
+    if not tried:
         return []
-    gains = []
-    for h, f in zip(open_, fits, strict=True):
-        rest = {b: downstream[b] for b in where[h.name] if b != block}
-        independent = {}
-        for channel in f.residuals:
-            # the larger count of the two: the better explained residual is the whiter
-            mine = f.independent[channel]
-            other = next((g.independent[channel] for g in (current, *rest.values()) if channel in g.independent), mine)
-            independent[channel] = max(mine, other)
-        gain = f.evidence(independent) - current.evidence(independent_for(current, independent))
-        gain -= sum(g.evidence(independent_for(g, independent)) for g in rest.values())
-        gains.append(gain + _log_odds(h))
+    counts = _counts([current, *downstream.values(), *(f for _, f in tried)])
+    gains = [f.evidence(counts) - current.evidence(counts) + _log_odds(h)
+             - sum(downstream[b].evidence(counts) for b in where[h.name] if b != block) for h, f in tried]
     weights = np.array([*gains, 0.0])
     weights = np.exp(weights - weights.max())
     probability = weights / weights.sum()
-    weighed = [Weighed(h, f, g, float(p)) for h, f, g, p in zip(open_, fits, gains, probability, strict=False)]
+    weighed = [Weighed(h, f, g, float(p)) for (h, f), g, p in zip(tried, gains, probability, strict=False)]
     return sorted(weighed, key=lambda w: -w.gain)
+
+
+def _counts(fits: Iterable[Fit]) -> dict[str, float]:
+    """Independent samples of each channel, one count for all fits that are compared: the whitest residual's."""
+    counts: dict[str, float] = {}
+    for f in fits:
+        for channel, n in f.independent.items():
+            counts[channel] = max(counts.get(channel, 0.0), n)
+    return counts
 
 
 def _log_odds(hypothesis: Hypothesis) -> float:
     """Prior log odds of a hypothesis against none further."""
     return math.log(EFFECT_ODDS / (sum(map(len, BLOCKS.values())) if hypothesis.number else 1))
-
-
-def independent_for(f: Fit, counts: Mapping[str, float]) -> dict[str, float]:
-    """The counts of the channels that a fit has."""
-    return {channel: counts[channel] for channel in f.residuals}
 
 
 def _material(before: Fit, after: Fit) -> bool:
