@@ -195,7 +195,9 @@ def test_several_effects(several):
 
 
 def test_unknown(friction):
-    page = Page(rendered(friction, verdict="unknown", effects=[], unexplained=["theta is off by 9.1 times the noise"]))
+    rows = [{**r, "found": False} for r in friction.body["which"]["candidates"]]
+    page = Page(rendered(friction, verdict="unknown", effects=[], candidates=rows,
+                         unexplained=["theta is off by 9.1 times the noise"]))
     assert page.text("h1") == ("The model lacks something that the catalogue does not hold, "
                                "in this part of the chain: arm.")
     assert "theta is off by 9.1 times the noise" in page.text("header")
@@ -204,9 +206,9 @@ def test_unknown(friction):
 
 def test_a_number_that_is_off(friction):
     refitted = friction.body["which"]["numbers"]["R_a"]["value"]
-    rows = [{"effect": "parameter_mismatch", "place": "electrical", "probability": p, "gap_after": 0.1,
+    rows = [{"effect": "parameter_mismatch", "place": "electrical", "probability": p, "gap_after": 0.1, "found": mine,
              "parameters": {"R_a": {"value": value, "low": 1.0, "high": 2.0}}}
-            for p, value in ((0.9, refitted), (0.1, 7.0))]
+            for p, value, mine in ((0.9, refitted, True), (0.1, 7.0, False))]
     page = Page(rendered(friction, verdict="parameter_mismatch", effects=["parameter_mismatch"], candidates=rows))
     assert page.text("h1") == "The structure of the model is right, but R_a (armature resistance) is off."
     assert "nominal 1.08 Ω" in page.text("header")
@@ -216,7 +218,7 @@ def test_a_number_that_is_off(friction):
 def test_effects_and_a_number_together(friction):
     rows = [r for r in friction.body["which"]["candidates"] if r["effect"] == "coulomb_friction"]
     value = friction.body["which"]["numbers"]["J_m"]["value"]
-    rows += [{"effect": "parameter_mismatch", "place": "rotor", "probability": 1.0, "gap_after": 0.1,
+    rows += [{"effect": "parameter_mismatch", "place": "rotor", "probability": 1.0, "gap_after": 0.1, "found": True,
               "parameters": {"J_m": {"value": value, "low": 0.9 * value, "high": 1.1 * value}}}]
     page = Page(rendered(friction, effects=["coulomb_friction", "parameter_mismatch"], candidates=rows))
     assert page.text("h1") == "The model lacks coulomb_friction, and J_m is off."

@@ -23,9 +23,9 @@ Values = Mapping[str, float]
 BLOCKS: dict[str, tuple[str, ...]] = {
     "actuator": ("k0", "k1", "k2", "k3"),
     "motor": ("R_a", "L_a", "K_e", "K_t", "J_m", "B_m", "k_load"),
-    "arm": ("mgd_over_J", "c_over_J", "L_over_J"),
+    "arm": ("k_thrust", "mgd_over_J", "c_over_J", "L_over_J"),
 }
-"""The parts of the cut chain and the model's numbers in each. `k_thrust` only enters as k_thrust · L_over_J."""
+"""The parts of the cut chain and the model's numbers in each."""
 
 PLACE_OF_NUMBER = {
     **dict.fromkeys(BLOCKS["actuator"], "actuator"), **dict.fromkeys(("R_a", "L_a", "K_e"), "electrical"),
@@ -94,7 +94,7 @@ class Chain:
         s = self.signals
         v = self.actuator(values)
         if s.has("v_a"):
-            v = v + smooth(s.v_a - v, round(0.05 / s.period))
+            v = v + structure(s.v_a - v, round(0.05 / s.period), s.sigma["v_a"])
             early = np.arange(len(s)) < s.after_unseen
             v = np.where(early & np.isfinite(s.v_a), s.v_a, v)
         self.voltage = v
@@ -141,7 +141,7 @@ class Chain:
             middle = (p.time - 0.5 * p.period)[~p.false]
             omega = omega + np.interp(np.arange(len(s)) * s.period, middle, error)
         elif s.has("omega"):
-            omega = omega + smooth(s.true_speed - omega, round(0.02 / s.period))
+            omega = omega + structure(s.true_speed - omega, round(0.02 / s.period), s.sigma["omega"])
         self.speed = np.maximum(omega, 0.0)
 
     # --- arm: speed -> angle
@@ -218,6 +218,13 @@ def smooth(x: Array, width: int) -> Array:
     total = np.convolve(np.where(known, x, 0.0), kernel, mode="same")
     count = np.convolve(known.astype(float), kernel, mode="same")
     return np.where(count > 0.0, total / np.maximum(count, 1.0), 0.0)
+
+
+def structure(residual: Array, width: int, sigma: float) -> Array:
+    """The slow part (N,) of a residual, shrunk by the share of it that white noise of `sigma` alone would show."""
+    slow = smooth(residual, width)
+    power = float(np.mean(slow * slow))
+    return slow * max(0.0, 1.0 - sigma * sigma / (width | 1) / power) if power > 0.0 else slow
 
 
 def difference(measured: Array, simulated: Array) -> Array:

@@ -245,8 +245,8 @@ def _random_torque(chains: Chains, findings: Mapping[str, Findings]) -> tuple[We
         g = fitted(chains.own(findings["arm"].base.values, 0))
         misfit, index = g.torque, g.index
     rate = np.gradient(_calm(np.nan_to_num(s.theta)), s.period)
-    variables = {"theta": s.theta[index], "theta_dot": rate[index], "omega": chain.speed[index],
-                 "i_a": s.i_a[index], "duty": s.duty[index], "t": index * s.period}
+    variables: dict[str, Array] = {"theta": s.theta[index], "theta_dot": rate[index], "omega": chain.speed[index],
+                 "i_a": s.i_a[index], "duty": s.duty[index], "t": np.asarray(index * s.period, dtype=float)}
     return torque, misfit[: len(index)], variables
 
 
@@ -316,7 +316,7 @@ def _joint(chains: Chains, findings: Mapping[str, Findings]) -> tuple[dict[str, 
 
     begun = [Unknown(u.name, u.mean, u.sd, u.low, u.high, start.get(u.name, u.start), u.log)
              for u in unknowns.values()]
-    joint = fit(residuals, begun, rounds=3, steps=2)
+    joint = fit(residuals, begun)
     return joint.values, joint.sd
 
 
@@ -326,8 +326,8 @@ def _neutral(model: Model, name: str) -> float:
     return CATALOGUE[owner].parameters[parameter].neutral if parameter else model.model[owner]
 
 
-def _interval(value: float, sd: float) -> dict[str, float]:
-    return {"value": value, "low": value - Z95 * sd, "high": value + Z95 * sd}
+def _interval(value: float, sd: float, low: float = -math.inf, high: float = math.inf) -> dict[str, float]:
+    return {"value": value, "low": max(value - Z95 * sd, low), "high": min(value + Z95 * sd, high)}
 
 
 def _candidates(findings: Mapping[str, Findings], values: Mapping[str, float], sd: Mapping[str, float],
@@ -345,20 +345,21 @@ def _candidates(findings: Mapping[str, Findings], values: Mapping[str, float], s
                     continue
                 if mine and w is not round_[0]:
                     continue
-                names = [u.name for u in h.starts[0]]
                 source, spread = (values, sd) if mine else (w.fit.values, w.fit.sd)
                 whole = {**values, **w.fit.values}
                 rows[h.name] = {
                     "effect": h.effect, "place": h.place, "probability": w.probability,
-                    "parameters": {n.rpartition(".")[2]: _interval(source[n], spread[n]) for n in names},
-                    "gap_after": gap_after if mine else (scorer.of(whole).total if w.probability > 1e-3 else None)}
+                    "parameters": {u.name.rpartition(".")[2]:
+                                   _interval(source[u.name], spread[u.name], u.low, u.high) for u in h.starts[0]},
+                    "found": mine,
+                    "gap_after": gap_after if mine else scorer.of(whole).total if w.probability > 1e-3 else None}
     for extra in (torque, spikes):
         if extra is not None:
             rows[extra.hypothesis.name] = {
                 "effect": extra.hypothesis.effect, "place": extra.hypothesis.place, "probability": extra.probability,
-                "parameters": {n.partition(".")[2]: _interval(v, extra.fit.sd[n])
+                "parameters": {n.partition(".")[2]: _interval(v, extra.fit.sd[n], 0.0)
                                for n, v in extra.fit.values.items()},
-                "gap_after": gap_after}
+                "found": True, "gap_after": gap_after}
     return sorted(rows.values(), key=lambda row: -row["probability"])  # type: ignore[operator]
 
 

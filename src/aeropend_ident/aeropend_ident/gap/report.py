@@ -70,7 +70,7 @@ def render(diagnosis: Diagnosis, document: Mapping[str, object], command: str) -
     environment = Environment(loader=PackageLoader("aeropend_ident", "gap"), autoescape=True, trim_blocks=True,
                               lstrip_blocks=True, undefined=StrictUndefined)
     environment.filters.update(quantity=quantity, percent=percent, probability=probability)
-    candidates = [_candidate(c, doc) for c in doc["which"]["candidates"]]
+    candidates = [_candidate(c) for c in doc["which"]["candidates"]]
     shown = [c for c in candidates if c["found"] or c["probability"] >= PROBABLE]
     numbers, reach = _numbers(doc)
     return environment.get_template("report.html.j2").render(
@@ -173,7 +173,7 @@ def _ends(low: float, high: float) -> list[str]:
 
 # --- what the page says
 
-def _candidate(row: Any, doc: Any) -> dict[str, Any]:
+def _candidate(row: Any) -> dict[str, Any]:
     effect = row["effect"]
     number = next(iter(row["parameters"]), "") if effect == PARAMETER_MISMATCH else ""
     parameters = []
@@ -186,20 +186,8 @@ def _candidate(row: Any, doc: Any) -> dict[str, Any]:
         "physics": _minus(f"{PARAMETERS[f'model.{number}'].description}; its value is off" if number
                           else CATALOGUE[effect].physics),
         "probability": row["probability"], "parameters": parameters, "gap_after": row["gap_after"],
-        "found": _found(row, number, doc),
+        "found": row["found"],
     }
-
-
-def _found(row: Any, number: str, doc: Any) -> bool:
-    """Whether this candidate is part of the augmented model; of the numbers blamed, those that were refitted."""
-    if row["effect"] not in doc["which"]["effects"]:
-        return False
-    if not number:
-        return True
-    rows = [r for r in doc["which"]["candidates"] if r["effect"] == PARAMETER_MISMATCH]
-    refitted = doc["which"]["numbers"]
-    exact = [r for r in rows for n, q in r["parameters"].items() if refitted.get(n, {}).get("value") == q["value"]]
-    return any(row is r for r in exact or rows[:1])
 
 
 def _title(doc: Any) -> str:

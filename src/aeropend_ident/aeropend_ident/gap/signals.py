@@ -166,6 +166,34 @@ def _noise_of(x: Array) -> float:
     return max(white, resolution / math.sqrt(12.0), 1e-6 * float(np.ptp(x)), 1e-9)
 
 
+def _pulse_times(at: NDArray[np.int64], passed: Array, period: float) -> Array:
+    """Instants (M,) of pulses.
+
+    Args:
+        at: (M,) samples in which they show first. passed: (M,) s since the pulse before; inf where that is not known.
+        period: s between samples.
+
+    A pulse fell into the period before its sample. Where intervals follow each other without a break, that holds for
+    all of them at once, and leaves little room for any.
+    """
+    time = (at - 0.5) * period
+    start = 0
+    while start < len(at):
+        low, high, since, stop = (at[start] - 1.0) * period, at[start] * period, 0.0, start + 1
+        offsets = [0.0]
+        while stop < len(at):
+            since += passed[stop]
+            narrower = max(low, (at[stop] - 1.0) * period - since), min(high, at[stop] * period - since)
+            if not narrower[0] < narrower[1]:
+                break
+            low, high = narrower
+            offsets.append(since)
+            stop += 1
+        time[start:stop] = 0.5 * (low + high) + np.array(offsets)
+        start = stop
+    return np.asarray(time, dtype=float)
+
+
 def _held_false(pulses: Pulses, n: int) -> NDArray[np.bool_]:
     """The samples (n,) at which a false period is held."""
     out = np.zeros(n, dtype=bool)
@@ -199,16 +227,19 @@ def find_pulses(omega: Array, period: float, sensing: Mapping[str, float]) -> Pu
     stopped = np.zeros(len(at), dtype=bool)  # the speed read 0 before this interval showed
     stopped[1:] = np.minimum.reduceat(held, at)[:-1] == 0.0 if len(at) else []
     false = np.zeros(len(at), dtype=bool)
+    passed = length.copy()  # time since the pulse of the interval before
     for j in range(1, len(at)):
-        rest = elapsed[j] - length[j]
         if not false[j - 1]:
             # a period repeated to the tick does not show: whole multiples of the one before may have passed unseen
-            rest -= max(round(rest / length[j - 1]), 0) * length[j - 1]
+            passed[j] += max(round((elapsed[j] - length[j]) / length[j - 1]), 0) * length[j - 1]
         starts_anew = stopped[j] and length[j] < SPEED_TIMEOUT
         alone = j + 1 < len(at) and speed[j] > PEAK * max(speed[j - 1], speed[j + 1])
-        false[j] = alone or (abs(rest) > 1.01 * period + 2.0 * sensing["speed_tick"] and not starts_anew)
-    time = (at - 0.5) * period
+        fits = abs(elapsed[j] - passed[j]) <= 1.01 * period + 2.0 * sensing["speed_tick"]
+        false[j] = alone or not (fits or starts_anew)
+        if false[j] or stopped[j]:
+            passed[j] = np.inf
+    time = _pulse_times(at, passed, period)
     slope = np.gradient(speed, time) if len(at) > 2 else np.zeros(len(at))
     tick = np.maximum(sensing["speed_tick"], 1e-6) * speed / np.maximum(length, 1e-9) if len(at) else np.zeros(0)
-    sigma = np.sqrt(tick**2 + sensing["speed_noise"] ** 2 + (0.4 * period * slope) ** 2 + (2e-4 * speed) ** 2)
+    sigma: Array = np.sqrt(tick**2 + sensing["speed_noise"] ** 2 + (0.4 * period * slope) ** 2 + (2e-4 * speed) ** 2)
     return Pulses(at, time, length, speed, sigma, false)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ def shares(amounts: Iterable[tuple[str, float]]) -> dict[str, float]:
     return {place: (x / everything if everything > 0.0 else 0.0) for place, x in total.items()}
 
 
-def regions(misfit: Array, variables: Mapping[str, Array], most: int = 3) -> list[dict[str, float | str]]:
+def regions(misfit: Array, variables: Mapping[str, Array], most: int = 3) -> list[dict[str, Any]]:
     """The ranges of each variable in which the misfit concentrates, most concentrated first.
 
     Args:
@@ -40,10 +41,12 @@ def regions(misfit: Array, variables: Mapping[str, Array], most: int = 3) -> lis
     energy = np.nan_to_num(misfit) ** 2
     if energy.sum() <= 0.0:
         return []
-    found = []
+    found: list[dict[str, Any]] = []
     for name, x in variables.items():
         known = np.isfinite(x)
-        edges = np.unique(np.quantile(x[known], np.linspace(0.0, 1.0, BINS + 1))) if known.sum() > BINS else []
+        if known.sum() <= BINS:
+            continue
+        edges = np.unique(np.quantile(x[known], np.linspace(0.0, 1.0, BINS + 1)))
         if len(edges) < 4:
             continue
         which = np.clip(np.searchsorted(edges, x[known], side="right") - 1, 0, len(edges) - 2)
@@ -53,8 +56,8 @@ def regions(misfit: Array, variables: Mapping[str, Array], most: int = 3) -> lis
         a, b = _best_run(share - time)
         found.append({"variable": name, "low": float(edges[a]), "high": float(edges[b + 1]),
                       "share": float(share[a:b + 1].sum()), "time": float(time[a:b + 1].sum())})
-    found.sort(key=lambda r: r["time"] - r["share"])  # type: ignore[operator]
-    return [r for r in found if r["share"] - r["time"] > NOTEWORTHY][:most]  # type: ignore[operator]
+    found.sort(key=lambda r: r["time"] - r["share"])
+    return [r for r in found if r["share"] - r["time"] > NOTEWORTHY][:most]
 
 
 def _best_run(x: Array) -> tuple[int, int]:
