@@ -17,6 +17,7 @@ import rclpy
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
 from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import JointState
 
@@ -98,7 +99,7 @@ class Listener:
     """Notes when samples of joint_states were due (their stamps) and when they were published (by the middleware)."""
 
     def __init__(self) -> None:
-        rclpy.init(args=[])
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         self._node = Node("benchmark")
         qos = QoSProfile(reliability=interface.QOS.reliability, history=interface.QOS.history, depth=5000)
         self._subscription = self._node.create_subscription(JointState, interface.JOINT_STATES, print, qos, raw=True)
