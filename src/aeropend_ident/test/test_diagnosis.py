@@ -52,6 +52,12 @@ def test_two_effects_in_one_place_are_both_found():
     assert set(body["which"]["effects"]) == {"coulomb_friction", "thrust_lag"}
 
 
+def test_effects_all_over_the_chain_are_found_and_nothing_else():
+    effects = {"speed_spikes": {}, "brush_drop": {}, "coulomb_friction": {}}
+    body = diagnose(BENCH, [recorded(73, effects, duration=60.0)], 2).body
+    assert set(body["which"]["effects"]) == set(effects)
+
+
 @pytest.mark.parametrize("number", ["R_a", "mgd_over_J", "J_m"])
 def test_a_number_that_is_far_off_is_named(number):
     model = drawn_rig(80, {})

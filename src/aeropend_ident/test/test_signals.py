@@ -67,6 +67,27 @@ def test_too_short_is_said():
         from_arrays(short, SAMPLE_PERIOD, BENCH.sensing)
 
 
+def test_nothing_happening_is_no_ground_for_a_verdict():
+    still = columns()
+    still["duty"] = np.zeros_like(still["duty"])
+    still["theta"] = 0.006 * np.round(np.random.default_rng(0).standard_normal(len(still["theta"])) / 3.0)
+    with pytest.raises(RecordingError, match="nothing happens"):
+        from_arrays(still, SAMPLE_PERIOD, BENCH.sensing)
+
+
+def test_a_channel_that_never_changes_is_left_out_and_said():
+    signals = from_arrays(columns(i_a=np.full(2941, 0.3)), SAMPLE_PERIOD, BENCH.sensing)
+    assert not signals.has("i_a")
+    assert any("i_a is 0.3 A all the time" in note for note in signals.notes)
+
+
+def test_lost_samples_do_not_make_true_periods_false():
+    duty = steps(30.0, 2)
+    read, _ = rig.record(BENCH, duty, 2)
+    read["omega"][np.random.default_rng(0).random(len(duty)) < 0.03] = np.nan
+    assert not find_pulses(read["omega"], SAMPLE_PERIOD, BENCH.sensing).false.any()
+
+
 def test_noise_larger_than_the_model_says_is_seen():
     data = columns()
     data["i_a"] = data["i_a"] + 0.05 * np.random.default_rng(0).standard_normal(len(data["i_a"]))

@@ -19,6 +19,7 @@ from aeropend_ident.gap.fit import Fit, Unknown, fit
 from aeropend_ident.gap.signals import CHANNELS, Signals
 from aeropend_ident.gap.which import (
     EFFECT_ODDS,
+    NUMBER_SD,
     Findings,
     Hypothesis,
     Weighed,
@@ -37,6 +38,9 @@ GOOD_ENOUGH = 1.3
 
 RANDOM_TORQUE = 0.35
 """A torque on the arm passes as random while the state explains less than this share of it."""
+
+SURE = 2.5
+"""Standard deviations by which an effect must differ from none, and a number from nominal, after the joint fit."""
 
 UNDECIDED = 0.05
 """Probability from which on a rival is not ruled out."""
@@ -92,6 +96,9 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
     torque, misfit, variables = _random_torque(chains, findings)
     progress("fitting the whole chain", 0.75)
     values, sd = _joint(chains, findings)
+    while weak := _weakest(model, findings, values, sd):
+        findings[weak[0]].found.remove(weak[1])
+        values, sd = _joint(chains, findings)
     base_values = {n: v for f in findings.values() for n, v in f.base.values.items() if n.startswith("initial.")}
     progress("measuring the gap", 0.9)
     before = [shrink.free_run(model, s, chains.own(base_values, k)) for k, s in enumerate(recordings)]
@@ -318,6 +325,19 @@ def _joint(chains: Chains, findings: Mapping[str, Findings]) -> tuple[dict[str, 
              for u in unknowns.values()]
     joint = fit(residuals, begun)
     return joint.values, joint.sd
+
+
+def _weakest(model: Model, findings: Mapping[str, Findings], values: Mapping[str, float], sd: Mapping[str, float]
+             ) -> tuple[str, list[Weighed]] | None:
+    """The finding (block, round) whose size the whole chain leaves least sure, if it is too unsure to be claimed."""
+    sure = []
+    for block, f in findings.items():
+        for round_ in f.found:
+            size = round_[0].hypothesis.starts[0][0].name
+            spread = max(sd[size], NUMBER_SD * abs(model.model[size]) if size in model.model else 0.0)
+            sure.append((abs(values[size] - _neutral(model, size)) / spread, block, round_))
+    worst = min(sure, key=lambda s: s[0], default=None)
+    return worst[1:] if worst is not None and worst[0] < SURE else None
 
 
 def _neutral(model: Model, name: str) -> float:

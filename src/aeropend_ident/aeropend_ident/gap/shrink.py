@@ -21,6 +21,9 @@ WINDOW = 2.0
 
 RESAMPLES = 2000
 
+AT_REST = 0.05
+"""A channel rests where its spread is below this share of its spread over the whole recording."""
+
 
 def free_run(model: Model, signals: Signals, values: Mapping[str, float] | None = None) -> dict[str, Array]:
     """Simulate from the applied duty alone and read it as the rig would, without chance.
@@ -70,7 +73,7 @@ class Gap:
 
     Attributes:
         rms: channel -> RMS of simulated minus measured, SI.
-        spread: channel -> standard deviation of the measured channel.
+        spread: channel -> standard deviation of the measured channel; of the whole recording where the channel rests.
         windows: (W, C) mean square over each bootstrap window, over spread squared.
     """
 
@@ -102,7 +105,9 @@ def gap(readings: Mapping[str, Array], signals: Signals, start: int, stop: int,
             continue
         error = np.where(known, readings[channel][start:stop] - measured, np.nan)
         rms[channel] = float(np.sqrt(np.nanmean(error**2)))
-        spread[channel] = max(float(np.std(measured[known])), signals.sigma[channel], 1e-12)
+        everywhere = float(np.nanstd(signals.channel(channel)))
+        here = float(np.std(measured[known]))
+        spread[channel] = max(here if here > AT_REST * everywhere else everywhere, signals.sigma[channel], 1e-12)
         squares.append(error**2 / spread[channel] ** 2)
     width = max(1, round(WINDOW / signals.period))
     edges = np.arange(0, max(stop - start - width, 0) + 1, width)

@@ -23,6 +23,9 @@ MINIMUM_DURATION = 5.0
 """s of data below which nothing is said."""
 
 
+STILL = 0.01
+"""Duty that changes by less is no excitation."""
+
 PEAK = 1.25
 """A rotor is too heavy for one interval to be this much faster than both of its neighbours."""
 
@@ -134,19 +137,28 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
         raise RecordingError(f"{name}: no duty was recorded (armature.percentage or duty_command); "
                              "without it the model has no input")
     duty = _held(columns["duty"])
-    train = max(1, round(n * (1.0 - held_out)))
-    pulses = None
-    if sensing["speed_pulses_per_rev"] > 0.0 and np.isfinite(columns["omega"]).any():
-        pulses = find_pulses(columns["omega"], period, sensing)
+    columns, said = dict(columns), [*notes]
+    for channel in ("omega", "i_a", "v_a"):
+        x = columns[channel][np.isfinite(columns[channel])]
+        if len(x) and np.ptp(x) == 0.0 and np.ptp(duty) > STILL:
+            columns[channel] = np.full(n, np.nan)
+            said.append(f"{channel} is {x[0]:g} {CHANNELS[channel]} all the time, whatever the duty: it is left out")
     lsb = {"theta": "angle", "i_a": "current", "v_a": "voltage"}
     sigma = {"omega": max(sensing["speed_noise"], _noise_of(columns["omega"]))}
     for channel, key in lsb.items():
         stated = math.hypot(sensing[f"{key}_noise"], sensing[f"{key}_lsb"] / math.sqrt(12.0))
         seen = _noise_of(columns[channel])
         sigma[channel] = seen if seen > 2.0 * stated else stated  # quantisation spoils what is seen of a small noise
+    if np.ptp(duty) < STILL and np.nanstd(columns["theta"]) < 2.0 * sigma["theta"]:
+        raise RecordingError(f"{name}: nothing happens in it, duty and angle stay where they are, so no verdict is "
+                             "possible; record while `excite` runs")
+    train = max(1, round(n * (1.0 - held_out)))
+    pulses = None
+    if sensing["speed_pulses_per_rev"] > 0.0 and np.isfinite(columns["omega"]).any():
+        pulses = find_pulses(columns["omega"], period, sensing)
     false_speed = _held_false(pulses, n) if pulses else _outliers(columns["omega"], sigma["omega"])
     return Signals(period, duty, columns["theta"], columns["omega"], columns["i_a"], columns["v_a"], sigma, pulses,
-                   false_speed, train, notes)
+                   false_speed, train, tuple(said))
 
 
 def _held(x: Array) -> Array:
@@ -166,24 +178,25 @@ def _noise_of(x: Array) -> float:
     return max(white, resolution / math.sqrt(12.0), 1e-6 * float(np.ptp(x)), 1e-9)
 
 
-def _pulse_times(at: NDArray[np.int64], passed: Array, period: float) -> Array:
+def _pulse_times(at: NDArray[np.int64], unseen: NDArray[np.int64], passed: Array, period: float) -> Array:
     """Instants (M,) of pulses.
 
     Args:
-        at: (M,) samples in which they show first. passed: (M,) s since the pulse before; inf where that is not known.
-        period: s between samples.
+        at: (M,) samples in which they show first. unseen: (M,) samples missing before those.
+        passed: (M,) s since the pulse before; inf where that is not known. period: s between samples.
 
     A pulse fell into the period before its sample. Where intervals follow each other without a break, that holds for
     all of them at once, and leaves little room for any.
     """
-    time = (at - 0.5) * period
+    earliest, latest = (at - 1.0 - unseen) * period, at * period
+    time = 0.5 * (earliest + latest)
     start = 0
     while start < len(at):
-        low, high, since, stop = (at[start] - 1.0) * period, at[start] * period, 0.0, start + 1
+        low, high, since, stop = earliest[start], latest[start], 0.0, start + 1
         offsets = [0.0]
         while stop < len(at):
             since += passed[stop]
-            narrower = max(low, (at[stop] - 1.0) * period - since), min(high, at[stop] * period - since)
+            narrower = max(low, earliest[stop] - since), min(high, latest[stop] - since)
             if not narrower[0] < narrower[1]:
                 break
             low, high = narrower
@@ -226,6 +239,8 @@ def find_pulses(omega: Array, period: float, sensing: Mapping[str, float]) -> Pu
     elapsed = np.diff(at, prepend=-(10**9)) * period
     stopped = np.zeros(len(at), dtype=bool)  # the speed read 0 before this interval showed
     stopped[1:] = np.minimum.reduceat(held, at)[:-1] == 0.0 if len(at) else []
+    known = np.flatnonzero(np.isfinite(omega))
+    unseen = at - 1 - known[np.maximum(np.searchsorted(known, at) - 1, 0)]  # samples missing before each, (M,)
     false = np.zeros(len(at), dtype=bool)
     passed = length.copy()  # time since the pulse of the interval before
     for j in range(1, len(at)):
@@ -234,11 +249,12 @@ def find_pulses(omega: Array, period: float, sensing: Mapping[str, float]) -> Pu
             passed[j] += max(round((elapsed[j] - length[j]) / length[j - 1]), 0) * length[j - 1]
         starts_anew = stopped[j] and length[j] < SPEED_TIMEOUT
         alone = j + 1 < len(at) and speed[j] > PEAK * max(speed[j - 1], speed[j + 1])
-        fits = abs(elapsed[j] - passed[j]) <= 1.01 * period + 2.0 * sensing["speed_tick"]
+        late = (1.01 + unseen[j] + unseen[j - 1]) * period + 2.0 * sensing["speed_tick"]
+        fits = abs(elapsed[j] - passed[j]) <= late
         false[j] = alone or not (fits or starts_anew)
         if false[j] or stopped[j]:
             passed[j] = np.inf
-    time = _pulse_times(at, passed, period)
+    time = _pulse_times(at, unseen, passed, period)
     slope = np.gradient(speed, time) if len(at) > 2 else np.zeros(len(at))
     tick = np.maximum(sensing["speed_tick"], 1e-6) * speed / np.maximum(length, 1e-9) if len(at) else np.zeros(0)
     sigma: Array = np.sqrt(tick**2 + sensing["speed_noise"] ** 2 + (0.4 * period * slope) ** 2 + (2e-4 * speed) ** 2)
