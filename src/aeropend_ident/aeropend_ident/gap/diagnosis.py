@@ -109,38 +109,17 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
     floors = scorer.floors()
     share, low, high = shrink.closed(gap_before, gap_after, floors)
 
-    groups = [(h.place, {u.name: _neutral(model, u.name) for u in h.starts[0]}) for h in found]
-    best = scorer.squared(values)
-    ablated = {h.name: max(scorer.squared({**values, **back}) - best, 0.0)
-               for h, (_, back) in zip(found, groups, strict=True)}
-    unexplained = _unexplained(findings, gap_after, floors)
-    if torque is not None:
-        ablated["gust"] = unexplained.pop("arm", 0.0)
-    if spikes is not None:
-        false = gap_before.rms["omega"] ** 2 - scorer.gap(before).rms["omega"] ** 2
-        ablated["speed_spikes"] = max(false, 0.0) / gap_before.spread["omega"] ** 2 / len(gap_before.rms)
-    amounts = [*((h.place, ablated[h.name]) for h in found), *unexplained.items(),
-               *((CATALOGUE[name].place, ablated[name]) for name in ("gust", "speed_spikes") if name in ablated)]
-    if not amounts:  # nothing but numbers within their uncertainty: how the gap that they leave is shared
-        for place in dict.fromkeys(PLACE_OF_NUMBER.values()):
-            back = {n: model.model[n] for n in values if PLACE_OF_NUMBER.get(n) == place}
-            amounts.append((place, max(scorer.squared({**values, **back}) - best, 0.0)))
-    parts = where.shares(amounts)
-
+    amounts = _amounts(found, values, scorer, torque, spikes, before, _unexplained(findings, gap_after, floors))
     candidates = _candidates(findings, values, sd, torque, spikes, scorer, gap_after.total)
-    order = sorted(ablated, key=lambda name: -ablated[name])
-    effects = list(dict.fromkeys(name.partition(":")[0] for name in order))
-    left = _left(findings, torque is not None)
-    verdict = effects[0] if effects else "none"
-    reasons = [f"{c} is off by {x:.1f} times a reading's noise" for c, x in left.items() if x > GOOD_ENOUGH]
-    if reasons and (not effects or (share is not None and share < 0.5 and not (torque or spikes))):
-        verdict = "unknown"
-    if verdict == "none":
-        place = "none"
-    elif verdict == "unknown":
-        place = max(parts, key=lambda p: parts[p])
-    else:
-        place = next((h.place for h in found if h.name == order[0]), None) or CATALOGUE[order[0]].place
+    reasons = [f"{c} is off by {x:.1f} times a reading's noise"
+               for c, x in _left(findings, torque is not None).items() if x > GOOD_ENOUGH]
+    parts = where.shares((place, amount) for _, place, amount in amounts)
+    ranked = sorted((a for a in amounts if a[0]), key=lambda a: -a[2])
+    effects = list(dict.fromkeys(name.partition(":")[0] for name, _, _ in ranked))
+    verdict, place = (effects[0], ranked[0][1]) if ranked else ("none", "none")
+    predictable = not (torque or spikes)
+    if reasons and (not effects or (share is not None and share < 0.5 and predictable)):
+        verdict, place = "unknown", max(parts, key=lambda p: parts[p])
 
     undecided = _not_separable(findings)
     augmented = _augmented(model, values, torque, spikes)
@@ -160,6 +139,29 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
     }
     progress("done", 1.0)
     return Diagnosis(model, augmented, recordings, before, after, body, {"misfit": misfit, **variables})
+
+
+def _amounts(found: Sequence[Hypothesis], values: Mapping[str, float], scorer: _Scorer, torque: Weighed | None,
+             spikes: Weighed | None, before: Sequence[Mapping[str, Array]], unexplained: dict[str, float]
+             ) -> list[tuple[str, str, float]]:
+    """(name, place, squared gap) of each finding: what comes back when it is taken out; no name for what is not one."""
+    model, best = scorer.model, scorer.squared(values)
+
+    def comes_back(nominal: Mapping[str, float]) -> float:
+        return max(scorer.squared({**values, **nominal}) - best, 0.0)
+
+    amounts = [(h.name, h.place, comes_back({u.name: _neutral(model, u.name) for u in h.starts[0]})) for h in found]
+    if torque is not None:
+        amounts.append((torque.hypothesis.name, torque.hypothesis.place, unexplained.pop("arm", 0.0)))
+    if spikes is not None:
+        with_, without = scorer.gap(before, known=False), scorer.gap(before)
+        amounts.append((spikes.hypothesis.name, spikes.hypothesis.place, max(with_.total**2 - without.total**2, 0.0)))
+    amounts += [("", place, amount) for place, amount in unexplained.items()]
+    if not amounts:  # nothing but numbers within their uncertainty: how the gap that they leave is shared
+        for place in dict.fromkeys(PLACE_OF_NUMBER.values()):
+            back = {n: model.model[n] for n in values if PLACE_OF_NUMBER.get(n) == place}
+            amounts.append(("", place, comes_back(back)))
+    return amounts
 
 
 class _Scorer:
