@@ -29,7 +29,7 @@ class PlainRecorder(Node):
         typestore = get_typestore(Stores.ROS2_JAZZY)
         for topic, kind in TOPICS.items():
             name = f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
-            connection = writer.add_connection(f"/{topic}", name, typestore=typestore)
+            connection = writer.add_connection(self.resolve_topic_name(topic), name, typestore=typestore)
             self.create_subscription(kind, topic, partial(self._write, connection), interface.QOS)
 
     def _write(self, connection: Any, message: Any) -> None:
