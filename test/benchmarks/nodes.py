@@ -245,7 +245,7 @@ def record(quick: bool) -> list[Figure]:
         one["lost_per_minute"] = one["lost"] / one["seconds"] * 60.0
     details = {"ours": ours, "peer": peer}
     if "plant_published" not in ours:
-        raise NotMeasuredError("record: the plant's counters are not in the bag, so nothing can be counted against them")
+        raise NotMeasuredError("record: the plant's counters are not in the bag: nothing to count against")
     short = ours["plant_published"] - ours["recorded_meanwhile"]  # may be one, a sample between counter and stamp
     on_grid = ours["lost"] - ours["plant_lost"] + ours["without_armature"] + ours["without_angle"]
     missing = Spread.of(max(on_grid, short if short > 1.0 else 0.0))
@@ -253,7 +253,8 @@ def record(quick: bool) -> list[Figure]:
         Figure(f"record, {seconds:.0f} s beside plant and excite: messages lost", "", missing, Target(0.0),
                f"rclpy + rosbags Writer, {min(seconds, 60.0):.0f} s",
                Spread.of(peer["lost"] + peer["without_armature"] + peer["without_angle"]), None, details,
-               f"plant counted {ours['plant_published']:.0f}, recorded meanwhile {ours['recorded_meanwhile']:.0f}", about),
+               f"plant counted {ours['plant_published']:.0f}, recorded meanwhile {ours['recorded_meanwhile']:.0f}",
+               about),
         Figure("record: CPU of a core", "%", Spread.of(ours["cpu_percent"]), None, "rclpy + rosbags Writer",
                Spread.of(peer["cpu_percent"]), None, load=about),
     ]
