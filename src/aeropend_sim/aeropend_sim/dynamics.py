@@ -33,6 +33,9 @@ equation = njit(cache=True, forceinline=True, error_model="numpy")
 THRUST_PIVOT_SPEED = 150.0
 """rad/s at which `thrust_exponent` leaves the thrust as it is (contract section 4)."""
 
+NO_LAG = 1e-6
+"""A lag shorter than this share of a step is none."""
+
 ROUND = 6755399441055744.0
 """1.5 · 2^52: added and taken off again, it rounds to the nearest integer."""
 
@@ -460,7 +463,7 @@ def advance_arm(state: State, wm: float, w1: float, c: Coefficients, e: Values |
     if e is None:
         y, yd, _, _ = arm(y, yd, 0.0, 0.0, f0, fm, f1, w0, wm, w1, 0.0, 0.0, c, e, x)
         return y, yd, f1, 0.0, 0.0
-    if e.thrust_lag_tau > 0.0:
+    if e.thrust_lag_tau > NO_LAG * c.h:
         k = x.air
         a = 1.0 / e.thrust_lag_tau
         s0, sm, s1 = a * f0, a * fm, a * f1
@@ -534,7 +537,7 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0
                      n["mgd_over_J"], n["c_over_J"], n["L_over_J"])
     if e is None:
         return c, None, None
-    air = lag(1.0 / e.thrust_lag_tau if e.thrust_lag_tau > 0.0 else 0.0, h)
+    air = lag(1.0 / e.thrust_lag_tau if e.thrust_lag_tau > NO_LAG * h else 0.0, h)
     gust_decay = math.exp(-period / e.gust_tau)
     return c, e, Extra(lag(1.0 / e.winding_heating_tau, h), air, n["R_a"], resistance, n["J_m"],
                        gust_decay, e.gust_sigma * math.sqrt(1.0 - gust_decay**2), 1.0 / (1.0 - e.mast_flex_coupling),

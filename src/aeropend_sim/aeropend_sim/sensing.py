@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from aeropend_sim.dynamics import Lag, lag
+from aeropend_sim.dynamics import NO_LAG, Lag, lag
 from aeropend_sim.effects import SPIKE_FACTOR
 from aeropend_sim.parameters import SAMPLE_PERIOD, Model
 
@@ -73,7 +73,7 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD) -> Chain:
         return float(parameters.get(name, 0.0))
 
     tau = s["angle_filter_tau"] + effect("encoder_lag", "tau")
-    rate = 1.0 / tau if tau > 0.0 else 0.0
+    rate = 1.0 / tau if tau > NO_LAG * period else 0.0
     return Chain(period, lag(rate, period), rate, effect("angle_offset", "bias"),
                  effect("encoder_eccentricity", "amplitude"), effect("encoder_eccentricity", "phase"),
                  s["angle_noise"], s["angle_lsb"], 1.0 + effect("current_gain", "gain"),

@@ -275,8 +275,12 @@ def _shortlist(chains: Chains, block: str, candidates: list[Hypothesis], known: 
     for (h, j), x in zip(groups, left, strict=True):
         if h.name not in best or x < best[h.name][0]:
             best[h.name] = (x, h, j)
-    ranked = sorted(best.values(), key=lambda item: item[0])
-    return [(h, j) for _, h, j in ranked[:SHORTLIST]]
+    ranked = [(h, j) for _, h, j in sorted(best.values(), key=lambda item: item[0])]
+    nominal = chains.model.model
+    # a number that has strayed far explains nothing more as a mismatch; it is only less surprising
+    strayed = [(h, j) for h, j in ranked[SHORTLIST:] if h.number and not chains.fit_nominal
+               and abs(current.values[h.number] - nominal[h.number]) > 2.0 * NUMBER_SD * abs(nominal[h.number])]
+    return ranked[:SHORTLIST] + strayed
 
 
 def _started(unknowns: Iterable[Unknown], values: Mapping[str, float]) -> list[Unknown]:
