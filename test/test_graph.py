@@ -62,7 +62,8 @@ def test_truth_and_clock_are_off_by_default(graph, start):
     expected = {"/joint_states", "/armature", "/diagnostics", "/parameter_events", "/rosout"}
 
     def topics():
-        endpoint(graph, graph.node.get_publishers_info_by_topic, JOINT_STATES)
+        if "plain" not in graph.node.get_node_names():
+            return set()
         return {name for name, _ in graph.node.get_publisher_names_and_types_by_node("plain", "/")}
 
     graph.until(lambda: expected <= topics(), "the plant's topics")
