@@ -105,7 +105,7 @@ def test_a_clock_that_goes_back_ends_it(graph, start):
 
 
 def test_the_plant_applies_it_in_fast_simulated_time(graph, start):
-    start("plant", *parameters(speed=4.0))
+    start("plant", *parameters(speed=2.0))
     with graph.listening(BatteryState, ARMATURE) as armature:
         excite = start(
             "excite", *parameters(kind="steps", sequence="[0.2, 0.5]", hold_max=2.0, duration=8.0, use_sim_time=True)

@@ -204,6 +204,9 @@ def _read_mcap(
                 closed = True
                 break
             left = size - stream.tell()
+            if left < length:  # it may be growing
+                size = file.stat().st_size
+                left = max(size - stream.tell(), 0)
             if opcode == _CHUNK:
                 body = stream.read(min(length, left))
                 chunk = _Chunk(body, whole=length <= left)
