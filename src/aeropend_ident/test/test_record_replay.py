@@ -207,10 +207,17 @@ def commands(bags, values, step_ns=200_000_000, topic="/duty_command"):
     return bags.Content([(topic, FLOAT, start + row * step_ns, bags.number(value)) for row, value in enumerate(values)])
 
 
+PLANT = ("/armature", "sensor_msgs/msg/BatteryState")
+
+
 def test_a_recorded_duty_drives_the_plant_and_leaves_it_at_rest(bags, processes):
-    bags.write(processes.folder / "commands", commands(bags, [0.25, 0.5, 0.125, 0.375]))
+    bags.write(processes.folder / "commands", commands(bags, [0.25, 0.5, 0.125, 0.375], 500_000_000))
     plant = processes.start(module="aeropend_sim.plant")
     recorder = record(processes, "bag")
+    deadline = time.monotonic() + 60  # the recorder hears the plant before it is driven
+    while not (processes.folder / "bag" / "metadata.yaml").exists() or not counts(processes.folder / "bag")[PLANT]:
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
     player = replay(processes, "commands", "topics:=duty_command", "wait:=60.0", "subscribers:=2")
     status, said = processes.wait(player)
     assert status == 0, said
