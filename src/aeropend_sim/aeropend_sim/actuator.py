@@ -6,6 +6,7 @@ All functions take and return scalars or arrays of one shape, SI units, duty 0..
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -64,8 +65,8 @@ def acting_voltage(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[
                    period: float, start: int = 0, before: float = 0.0) -> Array:
     """Voltage at the bridge over each hold of a duty series, with the effects that need no state.
 
-    A delay that is not a whole number of periods is shared between two holds in proportion, so that the volt-seconds
-    are right. `supply_sag` needs the current and is in `dynamics`.
+    A voltage that changes within a hold, because a delay is not a whole number of periods, is replaced by the constant
+    one that drives the winding to the same current. `supply_sag` needs the current and is in `dynamics`.
 
     Args:
         numbers: the model's numbers.
@@ -78,6 +79,23 @@ def acting_voltage(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[
     Returns:
         (N,) V.
     """
+    first, then, part = _over_hold(numbers, duty, effects, period, start, before)
+    if part == 0.0:
+        return then
+    lengths = period * numbers["R_a"] / numbers["L_a"]  # of the hold, in time constants of the winding
+    share = math.expm1(part * lengths) / math.expm1(lengths) if lengths < 500.0 else 0.0
+    return share * first + (1.0 - share) * then
+
+
+def sampled_voltage(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, float]],
+                    period: float, start: int = 0, before: float = 0.0) -> Array:
+    """As `acting_voltage`, at the instant of each sample, when each hold begins."""
+    return _over_hold(numbers, duty, effects, period, start, before)[0]
+
+
+def _over_hold(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, float]], period: float, start: int,
+               before: float) -> tuple[Array, Array, float]:
+    """Voltage (N,) at the beginning of each hold, voltage after a delayed change in it, and when in it that comes."""
     n = len(duty)
     time = (start + np.arange(n)) * period
 
@@ -88,11 +106,16 @@ def acting_voltage(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[
             v = np.maximum(0.0, v - effects["bridge_drop"]["v_drop"])
         return v
 
-    if "command_delay" not in effects:
-        return at_bridge(voltage(numbers, duty))
-    whole, part = divmod(effects["command_delay"]["delay"] / period, 1.0)
-    late = voltage(numbers, np.concatenate([np.full(int(whole) + 1, before), duty]))
-    return (1.0 - part) * at_bridge(late[1:n + 1]) + part * at_bridge(late[:n])
+    delay = effects.get("command_delay", {}).get("delay", 0.0) / period
+    whole = math.floor(delay + 1e-9)
+    part = max(delay - whole, 0.0) if delay - whole > 1e-9 else 0.0
+    if whole == 0 and part == 0.0:
+        v = at_bridge(voltage(numbers, duty))
+        return v, v, 0.0
+    # a duty that acts early is foreseen as far as the series goes, and taken to stay after its end
+    late = voltage(numbers, np.concatenate([np.full(max(whole + 1, 0), before), duty, duty[n - max(-whole, 0):]]))
+    then = at_bridge(late[1:n + 1])
+    return (at_bridge(late[:n]) if part > 0.0 else then), then, part
 
 
 def static_angle(numbers: Numbers, duty: ArrayLike) -> Array:

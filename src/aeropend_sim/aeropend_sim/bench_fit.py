@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from aeropend_sim import actuator
+from aeropend_sim.command import EXIT_CODES, Parser, interruptible
 from aeropend_sim.parameters import SAMPLE_PERIOD, Model, load
 from aeropend_sim.rig import record
 
@@ -217,9 +218,12 @@ def _first_rise(time: Array, y: Array) -> tuple[Array, Array]:
     return np.maximum.accumulate(y[:top]), time[:top]
 
 
+@interruptible
 def main(arguments: list[str] | None = None) -> int:
     """Fit, print the table and save the picture; the exit code."""
-    parser = argparse.ArgumentParser(prog="bench_fit", description="Fits the preset bench to the measured step.")
+    parser = Parser(prog="bench_fit", description="Fits the preset bench to the measured step.",
+                    epilog=f"examples:\n  python -m aeropend_sim.bench_fit --plot step.png\n\n{EXIT_CODES}",
+                    formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plot", type=Path, metavar="FILE", help="save a picture of the step (needs matplotlib)")
     path: Path | None = parser.parse_args(arguments).plot
     try:

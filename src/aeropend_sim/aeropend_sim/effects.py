@@ -43,6 +43,11 @@ class Effect:
     parameters: dict[str, EffectParameter]
     in_equations: bool = True
     """Whether `dynamics` holds its term, or only `actuator` or `sensing`, which shape the input and the reading."""
+    linear_in: str = ""
+    """What of its first two parameters acts linearly, if not the size alone.
+
+    `product`: the size, and the size times the second; `polar`: the size times the cosine and the sine of the second.
+    """
 
     @property
     def size(self) -> str:
@@ -59,8 +64,8 @@ _ENTRIES = (
            {"r_supply": P("Ω", 0.0, 0.15, 0.0, 5.0, "internal resistance of the supply")}),
     Effect("supply_drift", "actuator", "the battery empties: v = map(τ)(1 - rate t)",
            {"rate": P("1/s", 0.0, 2e-3, -0.02, 0.02, "relative loss of voltage per second")}, in_equations=False),
-    Effect("command_delay", "actuator", "the duty applied acts later",
-           {"delay": P("s", 0.0, 0.03, 0.0, 0.5, "time from the duty to its effect")}, in_equations=False),
+    Effect("command_delay", "actuator", "the duty applied acts later, or, by up to a sample period, earlier",
+           {"delay": P("s", 0.0, 0.03, -2.04e-3, 0.5, "time from the duty to its effect")}, in_equations=False),
     Effect("brush_drop", "electrical", "the brushes take v_brush tanh(i/0.02) of the armature voltage",
            {"v_brush": P("V", 0.0, 0.12, 0.0, 1.0, "voltage over the brushes")}),
     Effect("winding_heating", "electrical", "the winding warms: R = R_a (1 + gain T), Ṫ = i² - T/tau",
@@ -83,7 +88,7 @@ _ENTRIES = (
            {"k": P("1/rad", 0.0, 0.6, 0.0, 20.0, "drag over the arm's inertia")}),
     Effect("cable_torque", "arm", "the cable is a spring: - k (θ - theta0)",
            {"k": P("1/s²", 0.0, 4.0, 0.0, 60.0, "stiffness over the arm's inertia"),
-            "theta0": P("rad", 0.0, 0.4, -2.0, 2.0, "angle at which the cable is slack")}),
+            "theta0": P("rad", 0.0, 0.4, -2.0, 2.0, "angle at which the cable is slack")}, linear_in="product"),
     Effect("mast_flex", "arm", "the mast swings: q̈ + 2 zeta omega q̇ + omega² q = -coupling θ̈, acting back with -q̈",
            {"coupling": P("-", 0.0, 0.3, 0.0, 0.9, "share of the arm's inertia that the mode moves"),
             "omega": P("rad/s", 12.0, 12.0, 3.0, 300.0, "natural frequency of the mode"),
@@ -97,7 +102,8 @@ _ENTRIES = (
            {"tau": P("s", 0.0, 0.03, 0.0, 0.5, "what is added to each stage of the filter")}, in_equations=False),
     Effect("encoder_eccentricity", "sensing", "the magnet sits off the axis: θ + amplitude sin(θ + phase) is read",
            {"amplitude": P("rad", 0.0, 0.06, 0.0, 0.5, "amplitude of the error"),
-            "phase": P("rad", 0.5, 0.5, -math.pi, math.pi, "direction of the offset")}, in_equations=False),
+            "phase": P("rad", 0.5, 0.5, -math.pi, math.pi, "direction of the offset")}, in_equations=False,
+           linear_in="polar"),
     Effect("current_gain", "sensing", "i (1 + gain) is read",
            {"gain": P("-", 0.0, 0.3, -0.9, 3.0, "relative error of the reading")}, in_equations=False),
     Effect("current_offset", "sensing", "i + bias is read",

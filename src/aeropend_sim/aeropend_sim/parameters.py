@@ -15,6 +15,7 @@ from pathlib import Path
 import yaml
 
 from aeropend_sim.effects import CATALOGUE, PARAMETER_MISMATCH
+from aeropend_sim.untrusted import load_yaml, one_line, printable
 
 SAMPLE_PERIOD = 64 * 510 / 16e6
 """Sample period in s: Timer1 of a 16 MHz ATmega2560, 8-bit phase-correct PWM, prescaler 64 (thesis 4.3.2)."""
@@ -27,6 +28,9 @@ SECTIONS = ("model", "sensing", "effects")
 
 class ModelError(ValueError):
     """A model file, a preset or a number that cannot be used; the message is one line for a person."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(one_line(text))
 
 
 @dataclass(frozen=True)
@@ -211,11 +215,11 @@ def load(source: str | Path) -> Model:
             reason = getattr(error, "strerror", None) or "not a text file"
             raise ModelError(f"{source}: the model file cannot be read: {reason}") from None
     try:
-        tree = yaml.load(text, _Loader)
+        tree = load_yaml(text, _Loader)
     except yaml.MarkedYAMLError as error:
         line = f" at line {error.problem_mark.line + 1}" if error.problem_mark else ""
         raise ModelError(f"{name}: not valid YAML{line}: {error.problem}; see the presets for the form") from None
-    except (yaml.YAMLError, RecursionError):
+    except yaml.YAMLError:
         raise ModelError(f"{name}: not a model file; see the presets for the form") from None
     return from_flat(_node_parameters(tree, name), name)
 
@@ -271,7 +275,7 @@ def save(model: Model, path: str | Path, comment: str = "") -> None:
     tree: dict[str, object] = {"model": dict(model.model), "sensing": dict(model.sensing)}
     if model.effects:  # rcl's parser refuses an empty mapping
         tree["effects"] = {id_: dict(parameters) for id_, parameters in model.effects.items()}
-    head = "".join(f"# {line}\n" for line in comment.splitlines())
+    head = "".join(f"# {printable(line)}\n" for line in comment.splitlines())
     text = head + yaml.dump({"/**": {"ros__parameters": tree}}, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
     path = Path(path)
     temporary = None

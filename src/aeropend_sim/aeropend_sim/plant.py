@@ -16,15 +16,11 @@ Every parameter is read at start and fixed while the node runs: a recording belo
 """
 
 import ctypes
-import gc
 import math
-import os
 import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -36,14 +32,23 @@ from std_srvs.srv import SetBool, Trigger
 
 from aeropend_sim import interface
 from aeropend_sim.effects import CATALOGUE, PARAMETER_MISMATCH
-from aeropend_sim.parameters import PARAMETERS, PRESETS, SAMPLE_PERIOD, Model, ModelError, from_flat, load, to_flat
+from aeropend_sim.parameters import (
+    MODEL_NAMES,
+    PARAMETERS,
+    PRESETS,
+    SAMPLE_PERIOD,
+    Model,
+    ModelError,
+    from_flat,
+    load,
+    to_flat,
+)
+from aeropend_sim.realtime import CLOCK_STEP_NS, go_before_other_programs, monotonic_to_ros_ns, prepare_thread
 from aeropend_sim.ros import Diagnostics, Setting, UserError, Worker, declare, overrides, read_settings, run, usage
 
 PERIOD_NS = round(SAMPLE_PERIOD * 1e9)
 BACKLOG = 49
 """How many samples late the thread may be and still publish them all: 100 ms."""
-CLOCK_STEP_NS = 50_000_000
-"""A system clock that is off by more than this has been set."""
 
 SETTINGS = {
     "preset": Setting("bench", "model that supplies every number not given", choices=PRESETS),
@@ -53,6 +58,26 @@ SETTINGS = {
     ),
     "publish_truth": Setting(False, "publish truth/joint_states and truth/armature"),
 }
+
+def _setting(name: str) -> Setting:
+    """Describe one number of a model file, by its full name."""
+    section, _, rest = name.partition(".")
+    if section == "effects":
+        effect, _, key = rest.partition(".")
+        if effect != PARAMETER_MISMATCH:
+            q = CATALOGUE[effect].parameters[key]
+            return Setting(q.default, f"{CATALOGUE[effect].physics}: {q.description}", q.unit, q.low, q.high)
+        name = f"model.{key}"
+    p = PARAMETERS[name]
+    return Setting(p.low, p.description, p.unit, p.low, p.high)
+
+
+NUMBERS = [
+    *PARAMETERS,
+    *(f"effects.{effect.id}.{key}" for effect in CATALOGUE.values() for key in effect.parameters),
+    *(f"effects.{PARAMETER_MISMATCH}.{key}" for key in MODEL_NAMES),
+]
+"""The full name of every number that a model file may hold."""
 
 USAGE = usage(
     "plant: the simulated aeropendulum. Publishes joint_states and armature at 490.196 Hz, takes duty_command.",
@@ -65,6 +90,7 @@ USAGE = usage(
     ],
     "  model.*, sensing.*, effects.ID.*: the numbers of a model file; what an effect is not given takes its"
     " default\n  effects: " + ", ".join([*CATALOGUE, PARAMETER_MISMATCH]),
+    further={name: _setting(name) for name in NUMBERS},
 )
 
 
@@ -173,10 +199,10 @@ class Plant(Node):
         self._worker.stop()
 
     def _real_time(self, end: threading.Event) -> None:
-        _prepare_thread()
-        _go_before_other_programs()
+        prepare_thread()
+        go_before_other_programs()
         pace = self._pace = Pace(PERIOD_NS, BACKLOG)
-        to_ros = _monotonic_to_ros_ns()
+        to_ros = monotonic_to_ros_ns()
         while not end.is_set():
             given_up = pace.next()
             if given_up:
@@ -187,7 +213,7 @@ class Plant(Node):
                 self.get_logger().warn(f"stood still: {given_up} samples lost, {self._lost} in all")
             self._sample(pace.deadline + to_ros)
             if self._samples % 490 == 0:
-                step = _monotonic_to_ros_ns() - to_ros
+                step = monotonic_to_ros_ns() - to_ros
                 if abs(step) > CLOCK_STEP_NS:
                     periods = round(step / PERIOD_NS)
                     to_ros += periods * PERIOD_NS
@@ -195,7 +221,7 @@ class Plant(Node):
                     self.get_logger().warn(f"the system clock was set: stamps move by {periods * SAMPLE_PERIOD:.3f} s")
 
     def _simulate(self, end: threading.Event) -> None:
-        _prepare_thread()
+        prepare_thread()
         if self._speed > 0.0:
             self._pace = Pace(round(PERIOD_NS / self._speed), BACKLOG)
         stamp_ns = 0
@@ -308,48 +334,6 @@ def _with_defaults(flat: dict[str, Any]) -> dict[str, Any]:
         else:
             resolved[name] = value
     return resolved
-
-
-def _setting(name: str) -> Setting:
-    """Describe one number of a model file, by its full name."""
-    section, _, rest = name.partition(".")
-    if section == "effects":
-        effect, _, key = rest.partition(".")
-        if effect != PARAMETER_MISMATCH:
-            q = CATALOGUE[effect].parameters[key]
-            return Setting(q.default, f"{CATALOGUE[effect].physics}: {q.description}", q.unit, q.low, q.high)
-        name = f"model.{key}"
-    p = PARAMETERS[name]
-    return Setting(p.low, p.description, p.unit, p.low, p.high)
-
-
-def _prepare_thread() -> None:
-    """Keep other threads and the garbage collector from delaying this one."""
-    sys.setswitchinterval(0.0002)
-    gc.collect()
-    gc.freeze()
-
-
-def _go_before_other_programs() -> None:
-    """Ask for real-time priority, which root has, and others with a limit on rtprio; without it, do with what there is.
-
-    Every thread of the process needs it: one that holds a lock the sampling thread waits for would else itself wait for
-    other programs.
-    """
-    with suppress(OSError):
-        for thread in Path("/proc/self/task").iterdir():
-            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(1))
-
-
-def _monotonic_to_ros_ns() -> int:
-    """Return what turns `time.monotonic_ns()` into system time, ns: the tightest of five readings."""
-    readings = []
-    for _ in range(5):
-        before = time.monotonic_ns()
-        now = time.time_ns()
-        after = time.monotonic_ns()
-        readings.append((after - before, now - (before + after) // 2))
-    return min(readings)[1]
 
 
 def main(args: Sequence[str] | None = None) -> int:

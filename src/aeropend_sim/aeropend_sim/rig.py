@@ -68,11 +68,13 @@ class Rig:
         duty = np.ascontiguousarray(duty, dtype=float)
         n = len(duty)
         known = np.concatenate([self._past, duty])
-        v = actuator.acting_voltage(self.model.numbers(), known, self.model.effects, self.period,
-                                    self._count - len(self._past))[len(self._past):]
+        supplied = (self.model.numbers(), known, self.model.effects, self.period, self._count - len(self._past))
+        v = actuator.acting_voltage(*supplied)[len(self._past):]
+        sampled = actuator.sampled_voltage(*supplied)[len(self._past):]
         self._past = known[-self._history:]
         truth, read = np.empty((7, n)), np.empty((4, n))
         self._state = dynamics.run(v, self._kicks.standard_normal(n), self._state, *self._plant, truth)
+        truth[4] += sampled - v
         self._memory = sensing.read(read, truth, self._normal.standard_normal((n, 4)), self._uniform.random((n, 2)),
                                     self._memory, self._count == 0, self._chain)
         self._count += n

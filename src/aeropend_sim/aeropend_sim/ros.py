@@ -14,13 +14,16 @@ message info, raw or not.
 
 import difflib
 import math
+import os
 import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -33,19 +36,29 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.executors import Executor, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from aeropend_sim import interface
+from aeropend_sim.command import Parser, asked_to_complete, files
+from aeropend_sim.untrusted import check_yaml, one_line
+
+RCLError = rclpy_implementation.RCLError
 
 try:
     from rclpy.experimental import EventsExecutor
 except ImportError:  # an older rclpy
     EventsExecutor = SingleThreadedExecutor
 
+EXIT_CODES = "exit codes: 0 ended, by Ctrl-C too; 2 the command line or a parameter cannot be used (one line says why)"
+
 SPIN_S = 0.1
 """The longest the program takes to notice a signal, s."""
+
+LEAVE_S = 5.0
+"""s that the middleware is given to end, once the node has done its own part."""
 
 
 class UserError(Exception):
@@ -145,7 +158,8 @@ def _text(value: object) -> str:
 class Setting:
     """A parameter of a node: what the user may give, and what is taken otherwise.
 
-    The default's type is the parameter's type; a float also takes a YAML integer. Lists are lists of floats.
+    The default's type is the parameter's type; a float also takes a YAML integer. Lists are lists of floats. What is
+    `live` may be set while the node runs, which then must listen to it. A `path` may name a file.
     """
 
     default: bool | int | float | str | list[float]
@@ -154,6 +168,14 @@ class Setting:
     low: float = -math.inf
     high: float = math.inf
     choices: tuple[str, ...] = ()
+    live: bool = False
+    path: bool = False
+
+    def values(self, prefix: str) -> Iterable[str]:
+        """What a shell may offer as its value."""
+        if isinstance(self.default, bool):
+            return ("true", "false")
+        return (str(self.default), *files(prefix)) if self.path else self.choices
 
     def check(self, name: str, value: object) -> Any:
         """Return the value in the setting's own type, or raise UserError."""
@@ -178,9 +200,9 @@ class Setting:
         return kind(value)
 
     def descriptor(self) -> ParameterDescriptor:
-        """Describe the parameter to ROS tools: unit and meaning, range, and that it is fixed while the node runs."""
+        """Describe the parameter to ROS tools: unit and meaning, range, and whether it is fixed while the node runs."""
         text = f"[{self.unit}] {self.description}" if self.unit else self.description
-        descriptor = ParameterDescriptor(description=text, read_only=True)
+        descriptor = ParameterDescriptor(description=text, read_only=not self.live)
         if self.choices:
             descriptor.additional_constraints = "one of " + ", ".join(self.choices)
         if math.isfinite(self.low) and math.isfinite(self.high):
@@ -232,11 +254,70 @@ def read_settings(node: Node, table: Mapping[str, Setting], given: Mapping[str, 
     return values
 
 
-def usage(summary: str, table: Mapping[str, Setting], examples: Sequence[str], more: str = "") -> str:
-    """Return the text of `--help`."""
+@dataclass(frozen=True)
+class Usage:
+    """What `--help` of a node's program says, and what a shell completes.
+
+    Attributes:
+        text: of `--help`.
+        settings: the parameters, by full name.
+        word: what stands for the argument that is given without `--ros-args`; "" when there is none.
+    """
+
+    text: str
+    settings: Mapping[str, Setting]
+    word: str = ""
+
+    def show(self) -> None:
+        """Print the help; or tell the shell what may come next, and end."""
+        if asked_to_complete():
+            self._complete()
+        print(self.text)
+
+    def _complete(self) -> None:
+        parser = Parser()
+        if self.word:
+            parser.add_argument("word", nargs="?", metavar=self.word)
+        parser.add_argument("--ros-args", action="store_true", help="what follows is for ROS")
+        parser.add_argument("--params-file", action="append", metavar="FILE", help="file of parameters")
+        for option, meaning, completer in (
+            ("-p", "parameter", self._parameters),
+            ("-r", "other name", lambda **_: ("__ns:=/", "__node:=")),
+        ):
+            action = parser.add_argument(option, action="append", help=meaning)
+            action.completer = completer  # type: ignore[attr-defined]
+        parser.complete()
+
+    def _parameters(self, prefix: str, **_: Any) -> Mapping[str, str]:
+        """What may come next, and what it means."""
+        name, given, value = prefix.partition(":=")
+        if not given:
+            return {f"{name}:=": setting.description for name, setting in self.settings.items()}
+        setting = self.settings.get(name)
+        return {f"{name}:={one}": "" for one in setting.values(value)} if setting else {}
+
+
+def usage(
+    summary: str,
+    table: Mapping[str, Setting],
+    examples: Sequence[str],
+    more: str = "",
+    word: str = "",
+    further: Mapping[str, Setting] | None = None,
+) -> Usage:
+    """Describe a node's program.
+
+    Args:
+        summary: what it does.
+        table: its parameters.
+        examples: of command lines.
+        more: text below the parameters.
+        word: what stands for the argument that is given without `--ros-args`.
+        further: parameters that are told of in `more`.
+    """
     lines = [summary, "", "usage: " + examples[0]]
     lines += ["       " + example for example in examples[1:]]
-    lines += ["", "parameters (-p name:=value, or a ROS parameter file):"]
+    lines += ["", "parameters (-p name:=value, or a ROS parameter file):"] if table else []
     for name, setting in table.items():
         limits = ", ".join(setting.choices)
         if math.isfinite(setting.low) and math.isfinite(setting.high):
@@ -245,58 +326,78 @@ def usage(summary: str, table: Mapping[str, Setting], examples: Sequence[str], m
         default = str(setting.default).lower() if isinstance(setting.default, bool) else setting.default
         limits = f"{limits}{unit}; " if limits else ""
         lines.append(f"  {name:<18} {setting.description}; {limits}default {default}")
-    return "\n".join([*lines, *(["", more] if more else [])])
+    lines += ["", more] if more else []
+    return Usage("\n".join([*lines, "", EXIT_CODES]), {**table, **(further or {})}, word)
 
 
-def run(make_node: Callable[[], Node], args: Sequence[str] | None = None, usage: str | None = None) -> int:
+def no_options(words: Sequence[str]) -> None:
+    """Refuse options among the arguments that are not ROS's."""
+    no_words([word for word in words if word.startswith("-")])
+
+
+def no_words(words: Sequence[str]) -> None:
+    """Refuse every argument that is not ROS's."""
+    if words:
+        raise UserError(f"unknown argument '{words[0]}': set parameters with --ros-args -p name:=value, see --help")
+
+
+def run(
+    make_node: Callable[..., Node],
+    args: Sequence[str] | None = None,
+    usage: Usage | None = None,
+    read: Callable[[list[str]], Any] = no_words,
+) -> int:
     """Run one node until it is done or a signal comes, and end cleanly.
 
     SIGINT and SIGTERM, once or many times, at any moment from here on, end the program with exit code 0: rclpy's own
     handlers are not used because they tear the context down under a spinning executor.
 
     Args:
-        make_node: builds the node, after `rclpy.init`. May raise UserError.
+        make_node: builds the node, after `rclpy.init`, of what `read` returned unless that is None. May raise
+            UserError.
         args: command line without the program's name; None takes `sys.argv`.
-        usage: help text. When given, `--help` prints it, and any argument outside `--ros-args` is refused. When None
-            the caller has parsed the other arguments itself.
+        usage: what `--help` prints and a shell completes. When None, `read` does both.
+        read: takes the arguments outside `--ros-args`. May raise UserError.
 
     Returns:
         The exit code: 0, or 2 after a UserError, which is printed on standard error as one line.
     """
     argv = list(sys.argv[1:] if args is None else args)
+    if asked_to_complete() or {"-h", "--help"} & set(argv):
+        if usage is None:
+            read(["--help"])
+        else:
+            usage.show()
+        return 0
     program = Path(sys.argv[0]).stem or "aeropend"
     stop = Stop()
     stop.install()
+    code = 2
     try:
         with tempfile.TemporaryDirectory(prefix="aeropend_") as folder:
             readable = _readable_parameter_files(argv, folder)
             try:
-                if usage is not None and _wants_help(readable):
-                    print(usage.strip())
-                    return 0
+                words = read(_words(readable))
                 _init(readable)
             except UserError as error:  # say the user's file, not our copy of it
-                names = dict(zip(readable, argv, strict=True))
+                names = {copy: file for copy, file in zip(readable, argv, strict=True) if copy != file}
                 raise UserError(" ".join(names.get(word.strip("'."), word) for word in str(error).split())) from error
-        return _spin(make_node, stop)
+        code = _spin(make_node if words is None else partial(make_node, words), stop)
     except UserError as error:
-        print(f"{program}: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+        print(one_line(f"{program}: {' '.join(str(error).split())}"), file=sys.stderr)
     finally:
         stop.ignore()
-        rclpy.try_shutdown()
+        with _leaving(code):
+            rclpy.try_shutdown()
+    return code
 
 
-def _wants_help(argv: list[str]) -> bool:
+def _words(argv: list[str]) -> list[str]:
+    """The arguments that are not ROS's."""
     try:
-        rest = remove_ros_args(["node", *argv])[1:]
+        return list(remove_ros_args(["node", *argv])[1:])
     except Exception as error:  # rclpy has several unrelated classes for this
         raise UserError(_short(error)) from error
-    if {"-h", "--help"} & set(rest):
-        return True
-    if rest:
-        raise UserError(f"unknown argument '{rest[0]}': set parameters with --ros-args -p name:=value, see --help")
-    return False
 
 
 def _init(argv: list[str]) -> None:
@@ -330,8 +431,9 @@ def _readable_parameter_files(argv: list[str], folder: str) -> list[str]:
             continue
         path = argv[at + 1]
         try:
-            with Path(path).open(encoding="utf-8") as file:
-                root = yaml.compose(file, Loader=yaml.SafeLoader)
+            text = Path(path).read_text(encoding="utf-8")
+            check_yaml(text)
+            root = yaml.compose(text, Loader=yaml.SafeLoader)
         except OSError as error:
             raise UserError(f"cannot read parameter file '{path}': {error.strerror}") from error
         except UnicodeDecodeError as error:
@@ -386,6 +488,24 @@ def _fill_empty(node: yaml.Node) -> bool:
     return changed
 
 
+@contextmanager
+def _leaving(code: int) -> Iterator[None]:
+    """End the program after `LEAVE_S` if the middleware does not let go: it was seen to hang, if hardly ever."""
+
+    def leave() -> None:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+    patience = threading.Timer(LEAVE_S, leave)
+    patience.daemon = True
+    patience.start()
+    try:
+        yield
+    finally:
+        patience.cancel()
+
+
 def _spin(make_node: Callable[[], Node], stop: Stop) -> int:
     """Make the node, spin it to its end, take it down. Returns 0 or raises."""
     node: Node | None = None
@@ -393,7 +513,11 @@ def _spin(make_node: Callable[[], Node], stop: Stop) -> int:
     try:
         if stop.requested:
             return 0
-        node = make_node()
+        warnings.filterwarnings("ignore", "Failed to fini rosout", RuntimeWarning)  # after what is said below
+        try:
+            node = make_node()
+        except RCLError as why:
+            raise UserError(f"the node cannot be started: {_short(why)}") from why
         executor = EventsExecutor()
         executor.add_node(node)
         # spin() of the EventsExecutor can hang at the end; in slices it does not, and the flag is seen
@@ -403,11 +527,12 @@ def _spin(make_node: Callable[[], Node], stop: Stop) -> int:
         stop.ignore()
         if node is not None and hasattr(node, "close"):
             node.close()
-        if executor is not None:
-            executor.shutdown()
-        if node is not None:
-            with suppress(Exception):  # the node is going anyway
-                node.destroy_node()
+        with _leaving(2 if getattr(node, "error", None) else 0):
+            if executor is not None:
+                executor.shutdown()
+            if node is not None:
+                with suppress(Exception):  # the node is going anyway
+                    node.destroy_node()
     if error := getattr(node, "error", None):
         raise error
     return 0

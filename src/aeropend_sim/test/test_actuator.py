@@ -3,7 +3,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from aeropend_sim import actuator
@@ -122,14 +122,32 @@ def test_supply_drift_ends_at_an_empty_battery():
     assert not acting({"supply_drift": {"rate": 0.02}}, start=100_000).any()
 
 
+def current(v, delay=0.0):
+    """Current at the end of each hold in a winding at rest, of its response to each step of the voltage, exactly."""
+    steps, ends = np.diff(v, prepend=0.0), np.arange(1, len(v) + 1) * SAMPLE_PERIOD
+    past = np.maximum(0.0, ends[:, None] - (np.arange(len(v)) * SAMPLE_PERIOD + delay))
+    return -np.expm1(-past * BENCH["R_a"] / BENCH["L_a"]) @ steps / BENCH["R_a"]
+
+
 @given(delay=st.floats(0.0, 0.5))
-def test_delay_keeps_the_volt_seconds_of_each_step(delay):
-    """What comes after n holds is what the map gives until `delay` before, as if switched within a hold."""
-    v = actuator.voltage(BENCH, DUTY)
+@example(delay=2.5 * SAMPLE_PERIOD)
+def test_delay_leads_the_winding_where_a_switch_within_the_hold_does(delay):
     late = acting({"command_delay": {"delay": delay}})
-    edges = np.arange(len(DUTY) + 1) * SAMPLE_PERIOD
-    sums = np.concatenate([[0.0], np.cumsum(v) * SAMPLE_PERIOD])
-    assert np.cumsum(late) * SAMPLE_PERIOD == pytest.approx(np.interp(edges[1:] - delay, edges, sums), abs=1e-12)
+    assert current(late) == pytest.approx(current(actuator.voltage(BENCH, DUTY), delay), abs=1e-9)
+
+
+@given(whole=st.integers(0, 40), part=st.floats(0.01, 0.99), before=st.floats(0.0, 1.0))
+def test_sample_within_a_delay_still_reads_the_old_voltage(whole, part, before):
+    drop = {"bridge_drop": {"v_drop": 0.1}}
+    late = {"command_delay": {"delay": (whole + part) * SAMPLE_PERIOD}, **drop}
+    read = actuator.sampled_voltage(BENCH, DUTY, late, SAMPLE_PERIOD, before=before)
+    known = np.concatenate([np.full(whole + 1, before), DUTY])[:len(DUTY)]
+    assert read == pytest.approx(np.maximum(0.0, actuator.voltage(BENCH, known) - 0.1), abs=1e-12)
+
+
+@pytest.mark.parametrize("effects", [{}, {"command_delay": {"delay": 7.0 * SAMPLE_PERIOD}}])
+def test_sample_reads_what_acts_where_nothing_switches_within_a_hold(effects):
+    assert np.array_equal(actuator.sampled_voltage(BENCH, DUTY, effects, SAMPLE_PERIOD), acting(effects))
 
 
 def test_delay_of_whole_periods_shifts():

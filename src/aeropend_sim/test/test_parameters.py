@@ -186,10 +186,11 @@ BAD = {
     "name given twice": (BENCH.replace("R_a: 1.08", "R_a: 1.08\n      R_a: 1.2"),
                          f"not valid YAML at line {AFTER_R_A}: R_a is given twice; see the presets for the form"),
     "YAML": (BENCH.replace("R_a: 1.08", "R_a: *x"),
-             f"not valid YAML at line {AFTER_R_A - 1}: found undefined alias 'x'; see the presets for the form"),
+             (f"not valid YAML at line {AFTER_R_A - 1}: an alias (*name) is not read here: write its value out; "
+              "see the presets for the form")),
     "key that is a list": ("? [1, 2]\n: 3\n",
                            "not valid YAML at line 1: found unhashable key; see the presets for the form"),
-    "too deep": ("[" * 3000, "not a model file; see the presets for the form"),
+    "too deep": ("[" * 3000, "not valid YAML at line 1: nested deeper than 50; see the presets for the form"),
     "empty": ("", "not a model file; it starts with '/**:' and 'ros__parameters:' (see the presets)"),
     "other YAML": ("a: [b]\n", "not a model file; it starts with '/**:' and 'ros__parameters:' (see the presets)"),
     "binary": (b"\xff\xfe\x00\x01", "the model file cannot be read: not a text file"),
