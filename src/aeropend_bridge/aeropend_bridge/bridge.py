@@ -1,0 +1,341 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rig's board as a ROS 2 node, with the topics, services and rate of the simulated plant.
+
+Stamps are the instants of sampling, from the board's clock; see `clock` for how it becomes ROS time. After a port was
+opened or the board was reset, no sample is published until that clock has settled (0.4 s). What is missing in between
+is a gap in the stamps, and counted.
+
+The board sets the duty to 0 when it hears nothing for 100 ms. The simulated plant holds the last `duty_command`; so
+that both behave alike, the node repeats the present duty every `REPEAT_S`. It does so from the executor: when the node
+ends, hangs or loses its port, the motor stops. After the port was lost or the board was reset, the duty is 0 until the
+next command.
+
+One thread reads the port and publishes. Commands go out from the executor's callbacks, at once or not at all.
+"""
+
+import ctypes
+import math
+import sys
+import threading
+import time
+from collections.abc import Sequence
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import BatteryState, JointState
+from std_msgs.msg import Float64
+from std_srvs.srv import SetBool
+
+from aeropend_bridge import calibration, protocol
+from aeropend_bridge.clock import BoardClock
+from aeropend_bridge.link import Link, LinkError
+from aeropend_bridge.protocol import Flag, Hello, Mode, Sample, Scheme
+from aeropend_sim import interface
+from aeropend_sim.realtime import CLOCK_STEP_NS, go_before_other_programs, monotonic_to_ros_ns, prepare_thread
+from aeropend_sim.ros import Diagnostics, Setting, UserError, Worker, overrides, read_settings, run, usage
+
+REPEAT_S = 0.02
+"""Between repetitions of the present duty, s: the board may miss four."""
+RETRY_S = 0.1
+"""Between attempts to open the port, and to get an answer from the board, s."""
+SILENCE_S = 0.1
+"""Without a sample for this long, the board is not there, s."""
+
+ANSWER_S = 0.3
+"""A HELLO that comes later than this after asking was not asked for, s: the board has started anew."""
+
+SETTINGS = {
+    "port": Setting("/dev/ttyACM0", "serial port of the board; better a path in /dev/serial/by-id"),
+    "scheme": Setting("pwm", "how the board reads the encoder", choices=("pwm", "ssi")),
+    **{
+        f"{calibration.SECTION}.{name}": Setting(
+            getattr(calibration.default(), name), known.description, known.unit, known.low, known.high
+        )
+        for name, known in calibration.NUMBERS.items()
+    },
+}
+
+USAGE = usage(
+    "bridge: the board of a real aeropendulum. Publishes joint_states and armature at 490.196 Hz, takes duty_command.",
+    SETTINGS,
+    [
+        "bridge",
+        "bridge --ros-args -p port:=/dev/ttyACM1 -p scheme:=ssi",
+        "bridge --ros-args --params-file my_rig.yaml       (from `calibrate my_rig.yaml`)",
+    ],
+    "  flash the board with `make -C firmware flash`; wiring in firmware/README.md",
+)
+
+
+class Bridge(Node):
+    """The node. See the module's docstring for time and commands, and contract section 1 for topics."""
+
+    def __init__(self) -> None:
+        super().__init__("bridge", automatically_declare_parameters_from_overrides=True)
+        settings = read_settings(self, SETTINGS, overrides(self))
+        prefix = f"{calibration.SECTION}."
+        numbers = {name.removeprefix(prefix): value for name, value in settings.items() if name.startswith(prefix)}
+        self._calibration = calibration.Calibration(**numbers)
+        self._scheme = Scheme[settings["scheme"].upper()]
+        self._link = Link(settings["port"], protocol.BAUD)
+        self._receiver = protocol.Receiver()
+        latency_ns = protocol.FRAME_NS[self._scheme] + round(self._calibration.latency * 1e9)
+        self._clock_of_board = BoardClock(protocol.TICK_NS, latency_ns)
+        self._to_ros = monotonic_to_ros_ns()
+        self._lock = threading.Lock()  # of what commands and samples share
+        self._duty = 0.0
+        self._sequence = 0
+        self._enabled = True
+        self._settings_sent = self._commanded = 0.0
+        self._hello: Hello | None = None
+        self._asked = -math.inf
+        self._doubted: int | None = None
+        self._last: Sample | None = None
+        self._last_time = 0
+        self._heard = -math.inf
+        self._counts: dict[str, int] = dict.fromkeys(
+            ("samples", "lost samples", "bad frames", "refused commands", "dropped writes", "reconnects",
+             "board resets", "gaps", "clock steps", "samples without command", "receive errors on the board",
+             "speed pulses rejected", "angles with errors", "commands without board",
+             "commands refused by the board"), 0
+        )  # fmt: skip
+        self._gap_max = 0.0
+        self._stamp = 0
+        self._said = ""
+        self._load = (time.monotonic(), time.process_time())
+
+        qos = interface.QOS
+        self._joint_states = self.create_publisher(JointState, interface.JOINT_STATES, qos)
+        self._armature = self.create_publisher(BatteryState, interface.ARMATURE, qos)
+        self.create_subscription(Float64, interface.DUTY_COMMAND, self._on_duty, qos)
+        self.create_service(SetBool, interface.ENABLE, self._on_enable)
+        self._diagnostics = Diagnostics(self, self._report, "aeropendulum's board")
+        self._repeat = self.create_timer(REPEAT_S, self._on_repeat, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._worker = Worker(self, self._serve, "samples")
+        self._worker.start()
+
+    def close(self) -> None:
+        """Stop the motor and let go of the port."""
+        self._worker.stop()
+        if self._hello is not None:
+            self._duty = 0.0
+            self._command()
+        self._link.close()
+
+    # the thread that reads
+
+    def _serve(self, end: threading.Event) -> None:
+        prepare_thread()
+        go_before_other_programs()
+        while not end.is_set():
+            self._serve_port(end)
+
+    def _serve_port(self, end: threading.Event) -> None:
+        try:
+            self._link.open()
+            self._said = ""
+            self._receiver.restart()
+            self._converse(end)
+        except LinkError as error:
+            self._lose(str(error))
+            end.wait(RETRY_S)
+
+    def _lose(self, why: str) -> None:
+        if self._link.is_open:
+            self._counts["reconnects"] += 1
+        self._link.close()
+        self._forget_board()
+        if why != self._said:
+            self.get_logger().warn(f"{why}; trying again every {RETRY_S:g} s")
+            self._said = why
+
+    def _forget_board(self) -> None:
+        """The duty is 0 and stays so until the next command."""
+        with self._lock:
+            self._hello, self._last, self._duty = None, None, 0.0
+        self._clock_of_board.restart()
+
+    def _converse(self, end: threading.Event) -> None:
+        link, receiver = self._link, self._receiver
+        clock_checked = -math.inf
+        while not end.is_set():
+            now = time.monotonic()
+            if self._hello is None and now - self._asked >= RETRY_S:
+                self._ask()
+            if now - clock_checked >= 1.0:
+                clock_checked = now
+                self._follow_system_clock()
+            data, arrival_ns = link.read(RETRY_S)
+            samples: list[Sample] = []
+            for message in receiver.feed(data):
+                if isinstance(message, Sample):
+                    samples.append(message)
+                elif isinstance(message, Hello):
+                    samples.clear()  # from before the reset, or not known yet whose they are
+                    self._greet(message)
+                elif message.status != protocol.Status.OK:
+                    self._counts["commands refused by the board"] += 1
+            self._counts["bad frames"] = receiver.bad
+            if samples and self._hello is not None:
+                self._take(samples, arrival_ns)
+
+    def _ask(self) -> None:
+        self._asked = time.monotonic()
+        self._link.write(protocol.ask_hello())
+
+    def _greet(self, hello: Hello) -> None:
+        if hello.version != protocol.VERSION:
+            if self._doubted != hello.version:  # once more: a disturbed frame must not end the node
+                self._doubted = hello.version
+                self._ask()
+                return
+            raise UserError(
+                f"the board at {self._link.port} speaks protocol version {hello.version}, this bridge speaks"
+                f" {protocol.VERSION}: flash the firmware that came with it (make -C firmware flash"
+                f" PORT={self._link.port})"
+            )
+        self._doubted = None
+        firmware = ".".join(map(str, hello.firmware))
+        if self._hello is None:
+            self.get_logger().info(f"board at {self._link.port}: firmware {firmware}, build {hello.build:08x}")
+        elif time.monotonic() - self._asked > ANSWER_S:
+            self._counts["board resets"] += 1
+            self.get_logger().warn(f"the board was reset ({hello.why_reset()}): duty 0 until the next command")
+            self._forget_board()
+        with self._lock:
+            self._hello = hello
+            self._send_settings()
+
+    def _send_settings(self) -> None:
+        self._settings_sent = time.monotonic()
+        self._link.write(
+            protocol.set_mode(Mode.DIRECT)
+            + protocol.set_scheme(self._scheme)
+            + protocol.enable(self._enabled)
+        )
+        self._command()
+
+    def _take(self, samples: list[Sample], arrival_ns: int) -> None:
+        """Publish what came with one read; only the last frame's arrival tells something about time."""
+        clock, counts = self._clock_of_board, self._counts
+        for sample in samples:
+            board_ns = clock.extend(sample.time)
+            if self._last is not None:
+                periods = round((board_ns - self._last_time) / (protocol.SAMPLE_TICKS * protocol.TICK_NS))
+                if periods <= 0 or (clock.settled and clock.early_ns(board_ns, arrival_ns) > CLOCK_STEP_NS):
+                    counts["board resets"] += 1  # and its HELLO was lost
+                    self.get_logger().warn("the board's clock started anew: duty 0 until the next command")
+                    self._forget_board()
+                    return
+                counts["lost samples"] += periods - 1
+            self._last, self._last_time = sample, board_ns
+            self._note(sample)
+            if sample is samples[-1]:
+                clock.add(board_ns, arrival_ns)
+            if clock.settled:
+                self._publish(sample, clock.host_ns(board_ns) + self._to_ros)
+        self._heard = time.monotonic()
+
+    def _note(self, sample: Sample) -> None:
+        flags, counts = sample.flags, self._counts
+        counts["samples without command"] += bool(flags & Flag.COMMAND_TIMEOUT)
+        counts["receive errors on the board"] += bool(flags & Flag.RECEIVE_ERROR)
+        counts["speed pulses rejected"] += bool(flags & Flag.PULSE_REJECTED)
+        counts["angles with errors"] += bool(flags & Flag.SSI and flags & (Flag.SSI_PARITY | Flag.SSI_STATUS))
+
+    def _publish(self, sample: Sample, stamp_ns: int) -> None:
+        theta, omega, v_a, i_a, duty = self._calibration.measured(sample)
+        gap = (stamp_ns - self._stamp) * 1e-9
+        if self._stamp and gap > SILENCE_S:
+            self._counts["gaps"] += 1
+            self._gap_max = max(self._gap_max, gap)
+            self.get_logger().warn(f"no samples for {gap:.3f} s")
+        self._stamp = stamp_ns
+        self._joint_states.publish(interface.joint_states_message(stamp_ns, theta, omega))
+        self._armature.publish(interface.armature_message(stamp_ns, v_a, i_a, duty))
+        self._counts["samples"] += 1
+
+    def _follow_system_clock(self) -> None:
+        step = monotonic_to_ros_ns() - self._to_ros
+        if abs(step) > CLOCK_STEP_NS:
+            self._to_ros += step
+            self._counts["clock steps"] += 1
+            self.get_logger().warn(f"the system clock was set: stamps move by {step * 1e-9:.3f} s")
+
+    # the executor's callbacks
+
+    def _command(self) -> None:
+        """Send the present duty."""
+        self._commanded = time.monotonic()
+        self._sequence = (self._sequence + 1) & 0xFF
+        self._link.write(protocol.duty_command(self._sequence, self._duty))
+
+    def _on_duty(self, message: Float64) -> None:
+        if not math.isfinite(message.data):
+            self._counts["refused commands"] += 1
+            if self._counts["refused commands"] == 1:
+                self.get_logger().warn(f"duty_command {message.data} refused; further ones are only counted")
+            return
+        duty = ctypes.c_float(min(max(message.data, 0.0), 1.0)).value
+        with self._lock:
+            if self._hello is None:
+                self._counts["commands without board"] += 1
+            elif self._enabled:
+                self._duty = duty
+                self._command()
+
+    def _on_repeat(self) -> None:
+        with self._lock:
+            if self._hello is None:
+                return
+            if time.monotonic() - self._commanded > 0.5 * REPEAT_S:
+                self._command()
+            if self._last is not None and time.monotonic() - self._settings_sent > RETRY_S:
+                flags = self._last.flags
+                told = bool(flags & Flag.ENABLED), bool(flags & Flag.SSI), bool(flags & Flag.PID)
+                if told != (self._enabled, self._scheme == Scheme.SSI, False):
+                    self._send_settings()
+
+    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        with self._lock:
+            self._enabled = request.data
+            if not self._enabled:
+                self._duty = 0.0  # and it stays 0 after enabling, until the next command
+            if self._hello is not None:
+                self._send_settings()  # and again until the samples' flags say so
+        response.success = True
+        response.message = "enabled" if request.data else "disabled: duty 0"
+        return response
+
+    def _report(self) -> tuple[str, dict[str, object]]:
+        wall, cpu = time.monotonic(), time.process_time()
+        load = (cpu - self._load[1]) / (wall - self._load[0]) if wall > self._load[0] else 0.0
+        self._load = (wall, cpu)
+        self._counts["dropped writes"] = self._link.dropped
+        hello, lost = self._hello, self._counts["lost samples"]
+        connected = hello is not None and wall - self._heard < SILENCE_S
+        values: dict[str, object] = {
+            **self._counts,
+            "longest gap s": self._gap_max,
+            "connected": connected,
+            "enabled": self._enabled,
+            "port": self._link.port,
+            "firmware": ".".join(map(str, hello.firmware)) if hello else "",
+            "clock drift ppm": self._clock_of_board.drift * 1e6,
+            "clock stops": self._clock_of_board.stops,
+            "clock offset s": (self._stamp - self._last_time) * 1e-9,
+            "cpu share": load,
+        }
+        if not connected:
+            return self._said or f"the board at {self._link.port} says nothing", values
+        return (f"{lost} samples lost" if lost else ""), values
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point of `bridge`."""
+    return run(Bridge, args, USAGE)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A serial port that may go away and come back. Reading waits, writing never does."""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+import time
+from contextlib import suppress
+
+import serial
+
+
+class LinkError(Exception):
+    """The port cannot be opened, or is gone; the message is one line that says why and what to do."""
+
+
+class Link:
+    """One port.
+
+    One thread opens, reads and closes; any thread may write.
+
+    Args:
+        port: device path, looked up anew at each opening.
+        baud: bits/s.
+    """
+
+    def __init__(self, port: str, baud: int) -> None:
+        self.port = port
+        self._baud = baud
+        self._serial: serial.Serial | None = None
+        self._lock = threading.Lock()
+        self._torn = False
+        self.dropped = 0
+        """Writes that a full or missing port could not take."""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a port at present."""
+        return self._serial is not None
+
+    def open(self) -> None:
+        """Open the port, for this program alone.
+
+        Raises:
+            LinkError: it cannot be opened now.
+        """
+        self.close()
+        try:
+            opened = serial.Serial(self.port, self._baud, timeout=0, exclusive=True)
+        except (OSError, ValueError) as error:  # SerialException is an OSError
+            raise LinkError(self._reason(error)) from error
+        with self._lock:
+            self._serial, self._torn = opened, False
+
+    def _reason(self, error: Exception) -> str:
+        text = str(error)
+        if isinstance(error, FileNotFoundError) or "No such file" in text:
+            return f"there is no {self.port}: plug the board in, or name its port"
+        if "exclusively lock" in text:
+            return f"{self.port} is in use by another program: end it"
+        if "Permission denied" in text:
+            return f"{self.port} may not be opened: join its group (sudo usermod -aG dialout $USER) and log in anew"
+        return f"{self.port} cannot be opened: {getattr(error, 'strerror', None) or text}"
+
+    def close(self) -> None:
+        """Close the port if it is open."""
+        with self._lock:
+            if self._serial is not None:
+                with suppress(OSError):
+                    self._serial.close()
+                self._serial = None
+
+    def read(self, timeout_s: float) -> tuple[bytes, int]:
+        """Wait for bytes and return all there are, and the host's monotonic time at which they were there, ns.
+
+        Returns no bytes after `timeout_s`.
+
+        Raises:
+            LinkError: the port is gone.
+        """
+        if self._serial is None:
+            raise LinkError(f"{self.port} is not open")
+        try:
+            fd = self._serial.fileno()
+            if not select.select([fd], [], [], timeout_s)[0]:
+                return b"", time.monotonic_ns()
+            now = time.monotonic_ns()
+            data = os.read(fd, 65536)
+        except BlockingIOError:
+            return b"", time.monotonic_ns()
+        except (OSError, ValueError) as error:
+            raise LinkError(f"lost {self.port}: {getattr(error, 'strerror', None) or error}") from error
+        if not data:
+            raise LinkError(f"lost {self.port}: it was closed")
+        return data, now
+
+    def write(self, data: bytes) -> bool:
+        """Write a frame at once or not at all; False when it was dropped."""
+        with self._lock:
+            if self._serial is None:
+                self.dropped += 1
+                return False
+            if self._torn:  # ends the piece of a frame that went out
+                data = b"\0" + data
+            try:
+                written = os.write(self._serial.fileno(), data)
+            except (OSError, ValueError):  # full, or gone: then reading says so
+                self.dropped += 1
+                return False
+            self._torn = written < len(data)
+            self.dropped += self._torn
+            return not self._torn
