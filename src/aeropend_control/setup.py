@@ -13,7 +13,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
     ],
-    install_requires=["numpy", "rich", "scipy"],
+    install_requires=["numba", "numpy", "rich", "scipy"],
     extras_require={"test": ["pytest", "pytest-timeout"]},
     python_requires=">=3.10",
     zip_safe=False,
@@ -21,5 +21,16 @@ setup(
     maintainer_email="maintainers@aeropend.example",
     description="Excitation signals and controllers for the aeropendulum, one node each.",
     license="Apache-2.0",
-    entry_points={"console_scripts": ["excite = aeropend_control.excite:main"]},
+    entry_points={
+        "console_scripts": [
+            "excite = aeropend_control.excite:main",
+            "small_signal = aeropend_control.base:small_signal",
+            "feedback_linearization = aeropend_control.base:feedback_linearization",
+            "cascade = aeropend_control.base:cascade",
+            "feedback_linearization_cascade = aeropend_control.base:feedback_linearization_cascade",
+            "reference = aeropend_control.reference:main",
+            "step_test = aeropend_control.step_test:main",
+            "tune = aeropend_control.tune:main",
+        ]
+    },
 )
