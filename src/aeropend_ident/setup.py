@@ -14,8 +14,10 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
     ],
-    install_requires=["Jinja2", "lz4", "numba", "numpy", "PyYAML", "rich", "rosbags", "scipy", "threadpoolctl"],
-    extras_require={"test": ["mcap", "pytest", "pytest-timeout"]},
+    install_requires=["Jinja2", "joblib", "lz4", "numba", "numpy", "openpyxl", "PyYAML", "rich", "rosbags", "scipy",
+                      "threadpoolctl"],
+    extras_require={"dask": ["dask", "distributed"], "matlab": ["h5py"],
+                    "test": ["h5py", "mcap", "pytest", "pytest-timeout"]},
     python_requires=">=3.10",
     zip_safe=False,
     maintainer="aeropend maintainers",
@@ -24,10 +26,15 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
+            "import = aeropend_ident.import_table:main",
             "record = aeropend_ident.record:main",
             "replay = aeropend_ident.replay:main",
             "recover = aeropend_ident.recover:main",
             "diagnose = aeropend_ident.diagnose:main",
+            "identify = aeropend_ident.identify:main",
+            "bench_test = aeropend_ident.bench_test:main",
+            "excitation_quality = aeropend_ident.quality:main",
+            "step_response = aeropend_ident.step_response:main",
             "demo = aeropend_ident.demo:main",
         ]
     },

@@ -17,7 +17,7 @@ import tempfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -26,6 +26,8 @@ from lz4.frame import LZ4FrameDecompressor
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat, Qos
 from rosbags.rosbag2 import Reader
 from rosbags.rosbag2.metadata import parse_qos
+
+from aeropend_sim.untrusted import check_yaml, load_yaml, one_line
 
 if sys.version_info >= (3, 14):
     from compression.zstd import ZstdDecompressor
@@ -46,15 +48,22 @@ STORAGES = {".mcap": "mcap", ".db3": "sqlite3"}
 _MAGIC = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
 _LAST_OPCODE = 0x0F
-_LONGEST = 1 << 32  # a record that says it is longer says nonsense
+_LONGEST = 1 << 28  # bytes of a message or a chunk, unpacked; one that says it is longer says nonsense
+_MOST, _RATIO = 1 << 30, 100  # bytes that may be unpacked from a file; or so many times its size, whichever is more
+_PIECE = 1 << 24  # bytes unpacked at once
 _head = struct.Struct("<BQ")  # opcode, length of what follows
 _message_head = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
 _BATCH = 256  # rows salvaged at once
+_LATEST = (1 << 63) - 1  # ns
+_LONGEST_NAME = 255  # characters of a topic's name, as DDS has it
 
 
 class RecordingError(ValueError):
     """A recording cannot be used; the message is one line for the user."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(one_line(text))
 
 
 class Bag:
@@ -107,12 +116,17 @@ class Bag:
                 reader = _read_mcap if self.storage == "mcap" else _read_sqlite
                 try:
                     plain = self._unzipped(file, stack) if file.suffix == ".zstd" else file
+                    budget = _Budget(file)
                     for connection, time, data in reader(plain, chosen, self._say, self.counts):
-                        yield connection, time, self._unzip(data) if self._per_message_zstd else data
+                        if self._per_message_zstd:
+                            data = self._unzip(data)
+                            budget.take(len(data))
+                        yield connection, time, data
                 except OSError as error:
                     raise RecordingError(f"{file}: cannot be read: {error.strerror}") from error
 
     def _say(self, problem: str) -> None:
+        problem = one_line(problem)
         if problem not in self.problems:  # a bag may be read twice
             self.problems.append(problem)
 
@@ -126,14 +140,14 @@ class Bag:
             self._say("metadata.yaml is missing: the recording was broken off")
             return found
         try:
-            information = yaml.load(metadata.read_bytes(), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+            information = load_yaml(metadata.read_bytes())
             information = information["rosbag2_bagfile_information"]
             named = [folder / PurePosixPath(name).name for name in information["relative_file_paths"]]
             version = int(information["version"])
             mode = str(information.get("compression_mode") or "").lower()
             form = str(information.get("compression_format") or "")
             custom = dict(information.get("custom_data") or {})
-        except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
+        except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             if not found:
                 raise RecordingError(f"{folder}: not a bag: metadata.yaml is damaged and alone") from error
             self._say("metadata.yaml is damaged")
@@ -159,8 +173,12 @@ class Bag:
         decompressor = ZstdDecompressor()
         with file.open("rb") as packed, plain.open("wb") as out:
             try:
+                budget = _Budget(file)
                 while not decompressor.eof and (part := packed.read(1 << 20)):
-                    out.write(decompressor.decompress(part))
+                    for piece in _pieces(decompressor, part):
+                        budget.take(out.write(piece))
+            except RecordingError:
+                raise
             except Exception as error:  # the type differs between Python's own module and its backport
                 self._say(f"{file.name}: damaged: {error}")
         if not decompressor.eof:
@@ -169,9 +187,47 @@ class Bag:
 
     def _unzip(self, data: bytes) -> bytes:
         try:
-            return bytes(ZstdDecompressor().decompress(data))
+            return _unpacked(ZstdDecompressor(), data)
         except Exception:  # as above; what is left empty is not understood further on
             return b""
+
+
+class _Budget:
+    """How much a file may unpack to: what comes out of a small file in vast amounts is no recording."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._left = max(_MOST, _RATIO * file.stat().st_size)
+
+    def take(self, size: int) -> int:
+        """Count bytes, and return how many they were.
+
+        Raises:
+            RecordingError: it is too much.
+        """
+        self._left -= size
+        if self._left < 0:
+            raise RecordingError(f"{self._file}: unpacks to more than {_RATIO} times its size: not a recording")
+        return size
+
+
+def _pieces(decompressor: Any, packed: bytes) -> Iterator[bytes]:
+    """Unpack a part of a stream, a piece at a time."""
+    yield decompressor.decompress(packed, _PIECE)
+    while not (decompressor.eof or decompressor.needs_input):
+        yield decompressor.decompress(b"", _PIECE)
+
+
+def _unpacked(decompressor: Any, packed: bytes) -> bytes:
+    """Unpack a chunk or a message, as far as it is there.
+
+    Raises:
+        ValueError: it is too long. Others: the decompressor's own.
+    """
+    data = bytes(decompressor.decompress(packed, _LONGEST))
+    if not (decompressor.eof or decompressor.needs_input):
+        raise ValueError(f"it unpacks to more than {_LONGEST} bytes")
+    return data
 
 
 def _storage_suffix(file: Path) -> str | None:
@@ -194,6 +250,7 @@ def _read_mcap(
         if stream.read(8) != _MAGIC:
             raise RecordingError(f"{file}: not an MCAP file")
         records = _Records(chosen, counts)
+        budget = _Budget(file)
         closed = garbled = False
         while len(head := stream.read(_head.size)) == _head.size:
             opcode, length = _head.unpack(head)
@@ -207,11 +264,15 @@ def _read_mcap(
             if left < length:  # it may be growing
                 size = file.stat().st_size
                 left = max(size - stream.tell(), 0)
+            if length > _LONGEST and opcode in (_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK):
+                garbled = True
+                break
             if opcode == _CHUNK:
                 body = stream.read(min(length, left))
                 chunk = _Chunk(body, whole=length <= left)
                 if chunk.damage:
                     say(f"{file.name}: a chunk before byte {stream.tell()} is damaged: {chunk.damage}")
+                budget.take(len(chunk.data))
                 yield from records.read(chunk.data)
             elif length > left:
                 garbled = length > _LONGEST
@@ -253,9 +314,9 @@ class _Chunk:
             if not compression:
                 self.data = packed
             elif compression == "zstd":
-                self.data = ZstdDecompressor().decompress(packed)
+                self.data = _unpacked(ZstdDecompressor(), packed)
             elif compression == "lz4":
-                self.data = LZ4FrameDecompressor().decompress(packed)
+                self.data = _unpacked(LZ4FrameDecompressor(), packed)
             else:
                 self.damage = f"compression {compression!r} is not known"
         except Exception as error:  # the decompressors raise types of their own
@@ -294,7 +355,7 @@ class _Records:
                         break
                     tally.append(channel)
                     connection = wanted.get(channel)
-                    if connection is not None:
+                    if connection is not None and time <= _LATEST:
                         yield connection, time, data[start:position]
                 else:
                     _, length = _head.unpack_from(data, position)
@@ -338,6 +399,8 @@ class _Records:
         except (struct.error, UnicodeDecodeError):
             return
         msgtype, form, text = self.schemas.get(schema, ("", "", ""))
+        if not _is_name(topic, msgtype):
+            return
         connection = Connection(
             id=key,
             topic=topic,
@@ -362,8 +425,14 @@ def _text(body: bytes, place: int) -> tuple[str, int]:
     return body[place + 4 : end].decode(), end
 
 
+def _is_name(topic: object, msgtype: object) -> bool:
+    """Whether these can be names of a topic and its type: nothing else is shown to anybody."""
+    return all(isinstance(name, str) and name.isprintable() and len(name) <= _LONGEST_NAME for name in (topic, msgtype))
+
+
 def _qos(text: str) -> list[Qos]:
     try:
+        check_yaml(text)
         return parse_qos(text)
     except Exception:  # a profile that cannot be read is not worth a recording
         return []
@@ -382,7 +451,7 @@ def _read_sqlite(
     with file.open("rb") as stream:
         if stream.read(15) != b"SQLite format 3":
             raise RecordingError(f"{file}: not an SQLite file")
-    last, opened = -1, False
+    last, opened, budget = -1, False, _Budget(file)
     with ExitStack() as stack:
         beside = [Path(f"{file}{end}") for end in ("-wal", "-journal")]
         beside = [other for other in beside if other.is_file() and other.stat().st_size]
@@ -396,19 +465,52 @@ def _read_sqlite(
             file = folder / file.name
             _settle(file)
         try:
+            _check_tables(file)
             reader = stack.enter_context(Reader(file))
             wanted = []
             for connection in reader.connections:
+                if not _is_name(connection.topic, connection.msgtype):
+                    continue
                 counts[connection.topic, connection.msgtype] += connection.msgcount
                 if chosen is None or chosen(connection.topic, connection.msgtype):
                     wanted.append(connection)
             opened = True
             for connection, time, data in reader.messages(wanted) if wanted else ():
-                yield connection, time, data
-                last = time
+                if _is_message(time, data):
+                    budget.take(len(data))
+                    yield connection, time, data
+                    last = time
+        except RecordingError:
+            raise
         except Exception as error:  # rosbags and SQLite raise many types on a damaged file
-            say(f"{file.name} is damaged ({str(error).splitlines()[0]}): what could be read was read")
-            yield from _salvage(file, chosen, Counter() if opened else counts, last)
+            why = (str(error).splitlines() or [type(error).__name__])[0]
+            say(f"{file.name} is damaged ({why}): what could be read was read")
+            for connection, time, data in _salvage(file, chosen, Counter() if opened else counts, last):
+                budget.take(len(data))
+                yield connection, time, data
+
+
+def _check_tables(file: Path) -> None:
+    """Make sure that rosbags reads data, which ends, and YAML that does no harm.
+
+    Raises:
+        RecordingError: views or virtual tables, which are programs.
+        sqlite3.Error, yaml.YAMLError: the file is damaged.
+    """
+    with closing(sqlite3.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True)) as database:
+        _refuse_programs(database, file)
+        for table, column in (("topics", "offered_qos_profiles"), ("metadata", "metadata")):
+            if column in [row[1] for row in database.execute(f"PRAGMA table_info({table})")]:
+                for (text,) in database.execute(f"SELECT {column} FROM {table}"):  # noqa: S608 - names of ours
+                    check_yaml(str(text))
+
+
+def _refuse_programs(database: sqlite3.Connection, file: Path) -> None:
+    tables = database.execute("PRAGMA table_list").fetchall()
+    computed = [row for table in tables for row in database.execute("SELECT hidden FROM pragma_table_xinfo(?)",
+                                                                    (table[1],)) if row[0]]
+    if computed or any(table[2] != "table" for table in tables):
+        raise RecordingError(f"{file}: holds views or columns that compute what they show: not a bag")
 
 
 def _settle(file: Path) -> None:
@@ -436,7 +538,11 @@ def _salvage(file: Path, chosen: Chosen | None, counts: Counter[tuple[str, str]]
     try:
         # without this, SQLite refuses a file that is shorter than its header says
         database.execute("PRAGMA writable_schema=ON")
-        connections = {row["id"]: _connection(row) for row in _rows(database, "SELECT * FROM topics")}
+        with suppress(sqlite3.Error):  # what cannot be read cannot run
+            _refuse_programs(database, file)
+        query = "SELECT id, name, type, * FROM topics"  # nothing where one of them is missing
+        connections = {row["id"]: _connection(row) for row in _rows(database, query)
+                       if _is_name(row["name"], row["type"])}
         start, misses = 1, 0
         while misses < 64:
             query = "SELECT topic_id, timestamp, data FROM messages WHERE id BETWEEN ? AND ?"
@@ -444,7 +550,7 @@ def _salvage(file: Path, chosen: Chosen | None, counts: Counter[tuple[str, str]]
             start, misses = start + _BATCH, 0 if rows else misses + 1
             for row in rows:
                 connection = connections.get(row["topic_id"])
-                if connection is None or row["timestamp"] <= last:
+                if connection is None or not _is_message(row["timestamp"], row["data"]) or row["timestamp"] <= last:
                     continue
                 counts[connection.topic, connection.msgtype] += 1
                 if chosen is None or chosen(connection.topic, connection.msgtype):
@@ -462,6 +568,11 @@ def _rows(database: sqlite3.Connection, query: str, *arguments: Any) -> Iterator
         return
 
 
+def _is_message(time: object, data: object) -> bool:
+    """SQLite puts anything into any column."""
+    return isinstance(time, int) and isinstance(data, bytes)
+
+
 def _connection(row: sqlite3.Row) -> Connection:
     known = set(row.keys())
     return Connection(
@@ -472,7 +583,8 @@ def _connection(row: sqlite3.Row) -> Connection:
         digest=row["type_description_hash"] if "type_description_hash" in known else "",
         msgcount=0,
         ext=ConnectionExtRosbag2(
-            row["serialization_format"], _qos(row["offered_qos_profiles"] if "offered_qos_profiles" in known else "")
+            str(row["serialization_format"]) if "serialization_format" in known else "cdr",
+            _qos(row["offered_qos_profiles"] if "offered_qos_profiles" in known else "")
         ),
         owner=None,
     )

@@ -10,7 +10,7 @@ another layout starts a block of its own; what cannot be laid out is decoded one
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -23,6 +23,8 @@ from rosbags.typesys import Stores, get_typestore
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
+LONGEST = 1 << 16
+"""Bytes of a message; a longer one is no sample of a rig and is not decoded."""
 MAX_LAYOUTS = 32
 """A series with more layouts than this is not regular: the rest is decoded one by one."""
 
@@ -61,7 +63,8 @@ def decode(messages: Sequence[bytes], msgtype: str) -> tuple[list[Block], list[i
     single: list[int] = []
     lengths = np.fromiter(map(len, messages), dtype=np.int64, count=len(messages))
     layouts = 0
-    for length in np.unique(lengths):
+    failed = np.flatnonzero(lengths > LONGEST).tolist()
+    for length in np.unique(lengths[lengths <= LONGEST]):
         rows = np.flatnonzero(lengths == length)
         picked = messages if len(rows) == len(messages) else [messages[row] for row in rows.tolist()]
         raw = np.frombuffer(b"".join(picked), dtype=np.uint8).reshape(len(rows), length)
@@ -79,7 +82,6 @@ def decode(messages: Sequence[bytes], msgtype: str) -> tuple[list[Block], list[i
                 same = (raw[:, layout.fixed] == raw[0, layout.fixed]).all(axis=1)
                 blocks.append(layout.read(rows[same], raw[same]))
             rows, raw = rows[~same], raw[~same]
-    failed = []
     for row in sorted(single):
         block = _decode_one(row, messages[row], msgtype)
         if block is None:
@@ -87,6 +89,28 @@ def decode(messages: Sequence[bytes], msgtype: str) -> tuple[list[Block], list[i
         else:
             blocks.append(block)
     return blocks, failed
+
+
+def encode(template: bytes, msgtype: str, numbers: Mapping[str, NDArray[Any]]) -> list[bytes]:
+    """Serialize a series of messages that differ in numbers only: the inverse of `decode`.
+
+    Args:
+        template: one of them, serialized.
+        msgtype: its type.
+        numbers: field name with dots -> (n,) array, or (n, k) for a sequence of k numbers; what is left out stays as
+            in the template.
+
+    Raises:
+        ValueError, KeyError: the template has no such layout or field.
+    """
+    layout = _Layout(template, msgtype)
+    count = len(next(iter(numbers.values())))
+    raw = np.tile(np.frombuffer(template, dtype=np.uint8), (count, 1))
+    table = raw.view(layout.dtype(len(template)))[:, 0]
+    for name, values in numbers.items():
+        table[name] = values
+    whole, size = raw.tobytes(), len(template)
+    return [whole[k * size : (k + 1) * size] for k in range(count)]
 
 
 class _Layout:
@@ -114,13 +138,14 @@ class _Layout:
 
     def read(self, rows: NDArray[np.int64], raw: NDArray[np.uint8]) -> Block:
         """Read the numbers of messages of this layout: raw is (n, length)."""
+        table = np.ascontiguousarray(raw).view(self.dtype(raw.shape[1]))[:, 0]
+        return Block(rows, {name: table[name] for name in self.fields}, self.names)
+
+    def dtype(self, size: int) -> np.dtype[Any]:
+        """The numbers of a message of `size` bytes as a structured type."""
         kinds = [(self.order + kind, () if count is None else (count,)) for kind, _, count in self.fields.values()]
         offsets = [offset for _, offset, _ in self.fields.values()]
-        dtype = np.dtype(
-            {"names": list(self.fields), "formats": kinds, "offsets": offsets, "itemsize": max(raw.shape[1], 1)}
-        )
-        table = np.ascontiguousarray(raw).view(dtype)[:, 0]
-        return Block(rows, {name: table[name] for name in self.fields}, self.names)
+        return np.dtype({"names": list(self.fields), "formats": kinds, "offsets": offsets, "itemsize": max(size, 1)})
 
     def _walk(self, msgtype: str, prefix: str, fixed: list[range]) -> None:
         for name, (node, detail) in _fields(msgtype):

@@ -24,7 +24,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from aeropend_ident.diagnose import Parser
+from aeropend_sim.command import Parser
 from aeropend_sim.effects import CATALOGUE
 from aeropend_sim.parameters import Model, load, save
 
@@ -141,13 +141,13 @@ def is_right(drawn: str, which: dict[str, object]) -> bool:
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = Parser(prog="demo", description=__doc__.splitlines()[0],
                     epilog="examples:\n  demo\n  demo --effect coulomb_friction\n\n"
-                           "exit codes: 0 right verdict, 1 wrong verdict, 2 it could not run",
+                           "exit codes: 0 right verdict, 1 wrong verdict, 2 it could not run, 130 interrupted",
                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--effect", choices=[*CATALOGUE, "none"], metavar="ID",
                         help="pin the hidden effect: " + ", ".join([*CATALOGUE, "none"]))
     parser.add_argument("--duration", type=float, default=60.0, metavar="S", help="seconds to record (default: 60)")
     parser.add_argument("--seed", type=int, help="pin all chance (default: a new draw each time)")
-    parser.add_argument("--out", type=Path, help="folder for everything (default: demo-results/<time>)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for everything (default: demo-results/<time>)")
     options = parser.parse_args(arguments)
     if not (math.isfinite(options.duration) and 10.0 <= options.duration <= 600.0):
         parser.error(f"--duration {options.duration:g}: give 10 to 600 seconds")

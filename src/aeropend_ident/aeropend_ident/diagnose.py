@@ -7,50 +7,47 @@ Exit code 0 with a verdict, 2 with one line on standard error when the input can
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import shlex
-import shutil
 import sys
-import tempfile
+import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import NoReturn
 
+from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
 
-from aeropend_ident import recording
-from aeropend_ident.gap import report
-from aeropend_ident.gap.diagnosis import Diagnosis, diagnose
-from aeropend_ident.gap.signals import Signals, from_recording
-from aeropend_sim.effects import CATALOGUE, PARAMETER_MISMATCH
-from aeropend_sim.parameters import PARAMETERS, PRESETS, Model, ModelError, load, save
-
-FORMAT = 1
-FILES = ("diagnosis.json", "report.html", "augmented.yaml")
+from aeropend_ident import many
+from aeropend_ident.gap.across import across
+from aeropend_ident.gap.diagnosis import diagnose
+from aeropend_ident.output import OutputError, check
+from aeropend_ident.recording import RecordingError
+from aeropend_ident.results import FILES, Results, document
+from aeropend_ident.usable import signals_of
+from aeropend_sim.command import Parser
+from aeropend_sim.parameters import PRESETS, ModelError, load
+from aeropend_sim.untrusted import printable
 
 EXAMPLES = """examples:
   diagnose my_bag                                compare a recording with the preset 'bench'
   diagnose monday tuesday --model rig.yaml       several recordings of one rig, fitted together
+  diagnose monday --test tuesday                 fit on one recording, show on another how far the gap closes
+  diagnose --each rigs/* --out verdicts          a rig of its own each: one verdict a recording, and a table
+  diagnose --each rigs/* --dask tcp://host:8786  the same on a Dask cluster (pip install 'aeropend_ident[dask]')
+  diagnose let_go --fit-nominal                  a rig whose numbers nobody knows, even without its command
   diagnose my_bag --out verdict --jobs 2         choose the folder and the number of threads
   plant --ros-args --params-file verdict/augmented.yaml      run the model with what was found
 
 exit codes: 0 a verdict was written, 2 the input cannot be used (one line says why), 130 interrupted"""
 
-
-class OutputError(ValueError):
-    """The results cannot be written; the message is one line for a person."""
-
-
-class Parser(argparse.ArgumentParser):
-    """Says what is wrong with a command line in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        """End with exit code 2."""
-        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+SILENT = 2.0
+"""s of work before progress is shown."""
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -59,19 +56,41 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         prog="diagnose", epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Compare recordings of a rig with its model: where they part, which effect the model is missing, "
                     "and how far the gap closes once it is added.")
-    parser.add_argument("bags", nargs="+", metavar="BAG", help="a recording (folder, .mcap or .db3) of one rig")
+    parser.add_argument("bags", nargs="+", metavar="BAG",
+                        help="a recording (folder, .mcap or .db3); several are of one rig, unless --each")
+    parser.add_argument("--each", action="store_true",
+                        help="each recording is of a rig of its own: one verdict each in DIR/<name of the bag>, "
+                             f"and a table in DIR/{many.SUMMARY}")
     parser.add_argument("--model", default="bench", metavar="PRESET|FILE",
                         help=f"nominal model: {' or '.join(PRESETS)}, or a model file (default: bench)")
-    parser.add_argument("--out", metavar="DIR", help="folder for the results (default: diagnosis_<name of the bag>)")
+    parser.add_argument("--out", metavar="DIR",
+                        help="folder for the results (default: diagnosis_<name of the bag>; with --each: diagnoses)")
     parser.add_argument("--namespace", metavar="NS", help="namespace of the rig, when a bag holds several")
     parser.add_argument("--held-out", type=_share, default=0.3, metavar="SHARE",
                         help="share at the end of each recording kept for testing (default: 0.3)")
-    parser.add_argument("--jobs", type=_jobs, default=os.cpu_count() or 1, metavar="N",
-                        help="threads (default: one a core)")
+    parser.add_argument("--test", action="append", default=[], metavar="BAG",
+                        help="a further recording of the rig that nothing is fitted to: how far the gap closes there "
+                             "is told as well; may be given several times")
+    parser.add_argument("--jobs", type=_jobs, metavar="N",
+                        help="threads, or with --each processes (default: one a core); no verdict depends on it")
+    parser.add_argument("--dask", metavar="ADDRESS",
+                        help="with --each: let the workers of a Dask cluster do it, whose scheduler is there")
     parser.add_argument("--fit-nominal", action="store_true",
-                        help="the model's numbers are only a guess: fit them within a factor of three first")
+                        help="nobody knows the rig: identify its nominal model from the recordings first, as far as "
+                             "they tell; the command may be missing if the arm swings freely")
     parser.add_argument("--overwrite", action="store_true", help="replace results that are in the folder already")
-    return parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
+    if options.dask is not None and not options.each:
+        parser.error("--dask spreads recordings of different rigs: give --each with it")
+    if options.dask is not None and options.jobs is not None:
+        parser.error("--dask takes the workers that the cluster has: leave --jobs away")
+    if options.test and options.each:
+        parser.error("--test shows on a recording what others of the same rig said: leave --each away")
+    for bag in options.test:
+        if Path(bag).resolve() in {Path(fitted).resolve() for fitted in options.bags}:
+            parser.error(f"--test {bag}: that recording is fitted to; give it once, before or after --test")
+    options.jobs = options.jobs or os.cpu_count() or 1
+    return options
 
 
 def _share(text: str) -> float:
@@ -90,122 +109,124 @@ def _jobs(text: str) -> int:
     return int(text)
 
 
-def document(diagnosis: Diagnosis, bags: Sequence[str], model: str, seconds: float) -> dict[str, object]:
-    """The content of `diagnosis.json` (contract section 5)."""
-    signals = diagnosis.signals
-    duration = sum(len(s) * s.period for s in signals)
-    train = sum(s.train * s.period for s in signals)
-    return {"format": FORMAT, "bags": list(bags), "model": model, "duration_s": round(duration, 3),
-            "samples": sum(len(s) for s in signals), "train_s": [0.0, round(train, 3)],
-            "held_out_s": [round(train, 3), round(duration, 3)], **diagnosis.body,
-            "notes": [note for s in signals for note in s.notes], "seconds": round(seconds, 2)}
-
-
-def verdict_lines(body: Mapping[str, object]) -> list[str]:
-    """The verdict in a few lines for the terminal."""
-    which, where, shrink = body["which"], body["where"], body["shrink"]
-    assert isinstance(which, dict)
-    assert isinstance(where, dict)
-    assert isinstance(shrink, dict)
-    lines = []
-    if which["verdict"] == "none":
-        lines.append("verdict: none. The model explains the recording once its numbers are refitted.")
-    elif which["verdict"] == "unknown":
-        lines.append(f"verdict: unknown. Something in the {where['place']} that the catalogue does not explain: "
-                     + "; ".join(which["unexplained"]) + ".")
-    else:
-        lines.append(f"verdict: {' and '.join(which['effects'])} ({where['place']})")
-    found = {c["effect"]: c for c in reversed(which["candidates"])}
-    lines += [f"  {effect}: {describe(found[effect])}" for effect in which["effects"]]
-    lines += [f"  not separable from this recording: {' and '.join(pair)}" for pair in which["not_separable"]]
-    if which["next_experiment"]:
-        lines.append(f"  next: {experiment(which['next_experiment'])}")
-    gap, after, bottom = (100.0 * shrink[k] for k in ("gap", "gap_after", "floor"))
-    line = f"gap on held-out data: {gap:.1f} % of the signals' spread, {after:.1f} % with the augmented model"
-    if shrink["closed"] is None:
-        lines.append(f"{line}, floor {bottom:.1f} %: nothing to close")
-    else:
-        interval = "" if shrink["low"] is None else f" ({100 * shrink['low']:.0f} to {100 * shrink['high']:.0f} %)"
-        lines.append(f"{line}, floor {bottom:.1f} %: {100 * shrink['closed']:.0f} %{interval} of what can close")
-    return lines
-
-
-def experiment(advice: Mapping[str, object]) -> str:
-    """The advised experiment as a command."""
-    parameters = advice["excite"]
-    assert isinstance(parameters, dict)
-    command = "excite --ros-args " + " ".join(f"-p {k}:={v}" for k, v in parameters.items())
-    return f"{command} ({advice['why']})" if parameters else str(advice["why"])
-
-
-def describe(candidate: Mapping[str, object]) -> str:
-    """A candidate's parameters with units and 95 % intervals."""
-    parameters = candidate["parameters"]
-    assert isinstance(parameters, dict)
-    texts = []
-    for name, p in parameters.items():
-        if candidate["effect"] == PARAMETER_MISMATCH:
-            unit = PARAMETERS[f"model.{name}"].unit
-        else:
-            unit = CATALOGUE[str(candidate["effect"])].parameters[name].unit
-        texts.append(f"{name} = {p['value']:.4g} ({p['low']:.4g} to {p['high']:.4g}) {unit}")
-    return ", ".join(texts)
-
-
-def write(out: Path, files: Mapping[str, str], augmented: Model, comment: str, *, overwrite: bool) -> None:
-    """Write all results, or none.
-
-    Raises:
-        OutputError: the folder cannot be made or written, or holds results already.
-    """
-    taken = [name for name in FILES if (out / name).exists()]
-    if taken and not overwrite:
-        raise OutputError(f"{out}: holds {taken[0]} already; give another --out, or --overwrite to replace it")
-    made = not out.exists()
+@contextmanager
+def _shown(console: Console) -> Iterator[Progress]:
+    """A progress bar that shows up once the work has taken a while."""
+    bar = Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console, transient=True,
+                   disable=not console.is_terminal)
+    timer = threading.Timer(SILENT, bar.start)
+    timer.daemon = True
+    timer.start()
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=out, prefix=".writing_") as place:
-            for name, text in files.items():
-                (Path(place) / name).write_text(text, encoding="utf-8")
-            save(augmented, Path(place) / "augmented.yaml", comment)
-            for name in FILES:
-                (Path(place) / name).replace(out / name)
-    except OSError as error:
-        if made:
-            shutil.rmtree(out, ignore_errors=True)
-        raise OutputError(f"{out}: the results cannot be written: {error.strerror}; "
-                          "give another folder with --out or make room") from None
+        yield bar
+    finally:
+        timer.cancel()
+        timer.join()
+        if bar.live.is_started:
+            bar.stop()
 
 
-def run(options: argparse.Namespace, command: str, console: Console) -> Diagnosis:
-    """Diagnose and write the results.
+def run(options: argparse.Namespace, command: str, console: Console) -> None:
+    """Diagnose recordings of one rig together and write the results.
 
     Raises:
         RecordingError, ModelError, OutputError: the input or the output cannot be used.
     """
     started = time.monotonic()
-    out = Path(options.out or f"diagnosis_{Path(options.bags[0]).stem}")
-    if out.exists() and not out.is_dir():
-        raise OutputError(f"{out}: is a file; --out takes a folder")
-    if not options.overwrite and (taken := [name for name in FILES if (out / name).exists()]):
-        raise OutputError(f"{out}: holds {taken[0]} already; give another --out, or --overwrite to replace it")
+    out = Path(options.out or f"diagnosis_{many.names(options.bags[:1])[0]}")
+    check(out, FILES, overwrite=options.overwrite)
     model = load(options.model)
-    signals: list[Signals] = []
-    with Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console,
-                  transient=True, disable=not console.is_terminal) as bar:
+    with _shown(console) as bar:
         task = bar.add_task("reading", total=1.0)
-        signals += [from_recording(recording.read(bag, options.namespace), model.sensing, options.held_out)
-                    for bag in options.bags]
-        result = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal,
-                          progress=lambda what, share: bar.update(task, description=what, completed=share))
-    body = document(result, options.bags, options.model, time.monotonic() - started)
-    lines = [f"note: {note}" for s in signals for note in s.notes] + verdict_lines(body)
-    files = {"diagnosis.json": json.dumps(body, indent=1, allow_nan=False) + "\n",
-             "report.html": report.render(result, body, command)}
-    write(out, files, result.augmented, f"{command}\n" + "\n".join(lines), overwrite=options.overwrite)
-    print("\n".join(lines))
-    print(f"{out / 'report.html'}   {out / 'augmented.yaml'}   {body['seconds']} s")
-    return result
+        signals, tests = ([signals_of(bag, options.namespace, model.sensing, options.held_out,
+                                      fit_nominal=options.fit_nominal) for bag in bags]
+                          for bags in (options.bags, options.test))
+        found = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal,
+                         progress=lambda what, share: bar.update(task, description=what, completed=share))
+        shown = [{"bag": bag, **across(model, found.augmented, s)} for bag, s in zip(options.test, tests)]
+        body = document(found, options.bags, options.model, time.monotonic() - started, shown)
+        results = Results.of(found, body, command)
+    results.write(out, overwrite=options.overwrite)
+    print("\n".join(results.lines))
+    print(printable(f"{out / 'report.html'}   {out / 'augmented.yaml'}   {body['seconds']} s"))
+
+
+def run_each(options: argparse.Namespace, console: Console) -> int:
+    """Diagnose recordings of a rig each, write what is found as it comes, and a table of it; returns the exit code.
+
+    Raises:
+        ModelError, OutputError, ClusterError: none can be diagnosed.
+    """
+    started = time.monotonic()
+    out = Path(options.out or "diagnoses")
+    names = many.names(options.bags)
+    check(out, (many.SUMMARY,), overwrite=options.overwrite)
+    for name in names:
+        check(out / name, FILES, overwrite=options.overwrite)
+    settings = many.Settings(load(options.model), options.model, options.namespace, options.held_out,
+                             options.fit_nominal)
+    commands = [_alone(options, bag, out / name) for bag, name in zip(options.bags, names)]
+    rows = []
+    try:
+        with many.cluster(options.dask) as client, _shown(console) as bar:
+            task = bar.add_task(f"0 of {len(names)} recordings", total=len(names))
+            outcomes = many.diagnose_each(options.bags, commands, settings, options.jobs, client)
+            for name, outcome in zip(names, outcomes):
+                if outcome.results is not None:
+                    outcome.results.write(out / name, overwrite=options.overwrite)
+                rows.append(many.row(outcome, name))
+                bar.update(task, description=f"{len(rows)} of {len(names)} recordings", completed=len(rows))
+    except KeyboardInterrupt:
+        done = sum((out / name / "diagnosis.json").exists() for name in names)
+        raise Interrupted(f"interrupted; {done} of {len(names)} verdicts are in {out}" if done else
+                          "interrupted, nothing written") from None
+    many.write_summary(out, rows)
+    print_table(rows)
+    refused = sum(bool(row["error"]) for row in rows)
+    if refused == len(rows) == 1:
+        print(f"diagnose: {rows[0]['error']}", file=sys.stderr)
+        return 2
+    if refused == len(rows):
+        print(f"diagnose: none of the {refused} recordings can be used; {out / many.SUMMARY} says why", file=sys.stderr)
+        return 2
+    print(printable(f"{len(rows) - refused} of {len(rows)} diagnosed   {out / many.SUMMARY}   "
+                    f"{time.monotonic() - started:.1f} s"))
+    return 0
+
+
+def _alone(options: argparse.Namespace, bag: str, out: Path) -> str:
+    """The command that gives the verdict of one of many recordings by itself."""
+    words = ["diagnose", bag, "--out", str(out), "--model", options.model, "--held-out", f"{options.held_out:g}"]
+    words += ["--namespace", options.namespace] if options.namespace is not None else []
+    return shlex.join(words + ["--fit-nominal"] * options.fit_nominal)
+
+
+def print_table(rows: Sequence[dict[str, object]]) -> None:
+    """The summary for a person, on standard output; as wide as it needs to be where that is no terminal."""
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=10_000)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for heading in ("recording", "verdict", "place", "effects", "gap closed"):
+        table.add_column(heading, overflow="fold")
+    table.add_column("s", justify="right")
+    for row in rows:
+        if row["error"]:
+            table.add_row(_cell(row["recording"]), "cannot tell", "", _cell(row["error"]))
+        else:
+            closed = "nothing to close" if row["closed"] == "" else f"{100.0 * float(str(row['closed'])):.0f} %"
+            table.add_row(_cell(row["recording"]), str(row["verdict"]), str(row["place"]), str(row["effects"]), closed,
+                          f"{row['seconds']:.1f}")
+    console.print(table)
+
+
+def _cell(text: object) -> str:
+    """What a name says, not what it would do."""
+    return escape(printable(str(text)))
+
+
+class Interrupted(Exception):  # noqa: N818
+    """Ctrl-C; the message says what was done until then."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -215,12 +236,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments = arguments[: arguments.index("--ros-args")]
     options = parse(arguments)
     try:
+        if options.each:
+            return run_each(options, Console(stderr=True))
         run(options, shlex.join(["diagnose", *arguments]), Console(stderr=True))
-    except (recording.RecordingError, ModelError, OutputError) as error:
+    except (RecordingError, ModelError, OutputError, many.ClusterError) as error:
         print(f"diagnose: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("diagnose: interrupted, nothing written", file=sys.stderr)
+        return 130
+    except Interrupted as error:
+        print(f"diagnose: {error}", file=sys.stderr)
         return 130
     return 0
 

@@ -4,11 +4,16 @@
 from __future__ import annotations
 
 import importlib
+import os
+import re
+import sys
 from pathlib import Path
 from typing import Any
 
 from rosbags.typesys import get_types_from_msg
 from rosbags.typesys.store import Typestore
+
+_NAME = re.compile(r"[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*")
 
 
 def message_class(msgtype: str) -> Any:
@@ -17,11 +22,27 @@ def message_class(msgtype: str) -> Any:
     Raises:
         LookupError: there is no such type installed.
     """
-    package, _, name = msgtype.partition("/msg/")
+    definition(msgtype)
+    package, _, name = msgtype.split("/")
     try:
         return getattr(importlib.import_module(f"{package}.msg"), name)
-    except (ImportError, AttributeError, ValueError) as error:
+    except (ImportError, AttributeError) as error:
         raise LookupError(f"message type {msgtype} is not installed") from error
+
+
+def definition(msgtype: str) -> Path:
+    """The .msg file of a type that a ROS package provides: to import anything else would run anybody's code.
+
+    Raises:
+        LookupError: there is none.
+    """
+    package, _, name = msgtype.partition("/msg/")
+    prefixes = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]  # an environment is one, too
+    for prefix in filter(None, prefixes) if _NAME.fullmatch(msgtype) else ():
+        share = Path(prefix) / "share"
+        if (share / "ament_index" / "resource_index" / "rosidl_interfaces" / package).is_file():
+            return share / package / "msg" / f"{name}.msg"
+    raise LookupError(f"message type {msgtype} is not installed")
 
 
 def learn(typestore: Typestore, msgtype: str) -> None:
@@ -32,13 +53,9 @@ def learn(typestore: Typestore, msgtype: str) -> None:
     """
     if msgtype in typestore.types:
         return
-    package, _, name = msgtype.partition("/msg/")
     try:
-        from ament_index_python.packages import get_package_share_directory
-
-        file = Path(get_package_share_directory(package)) / "msg" / f"{name}.msg"
-        types = get_types_from_msg(file.read_text(encoding="utf-8"), msgtype)
-    except Exception as error:  # there may be no ROS; ament's, the file system's and the parser's own
+        types = get_types_from_msg(definition(msgtype).read_text(encoding="utf-8"), msgtype)
+    except Exception as error:  # there may be no such type; the file system's and the parser's own
         raise LookupError(f"the definition of message type {msgtype} cannot be had: {error}") from error
     for _, fields in types.values():
         for _, field in fields:

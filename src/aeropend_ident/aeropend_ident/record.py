@@ -15,7 +15,7 @@ import sqlite3
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,6 @@ from typing import Any
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.utilities import remove_ros_args
 from rclpy.validate_topic_name import validate_topic_name
 from rich.console import Console
 from rich.live import Live
@@ -36,7 +35,17 @@ from aeropend_ident.bag import STORAGES
 from aeropend_ident.msgtypes import learn, message_class
 from aeropend_ident.writer import PLUGINS, BagWriter
 from aeropend_sim import interface
-from aeropend_sim.ros import Diagnostics, Setting, UserError, Worker, overrides, read_settings, run, usage
+from aeropend_sim.ros import (
+    Diagnostics,
+    Setting,
+    UserError,
+    Worker,
+    no_options,
+    overrides,
+    read_settings,
+    run,
+    usage,
+)
 
 TAKE_S = 0.01
 CHECKPOINT_S = 0.5
@@ -83,6 +92,7 @@ USAGE = usage(
         "record my_bag --ros-args -r __ns:=/rig1 -p truth:=true -p storage:=sqlite3",
     ],
     "  OUT is named after the time when it is left out. Ctrl-C ends the recording.",
+    "OUT",
 )
 
 
@@ -176,7 +186,7 @@ class Record(Node):
             start_parameter_services=False,
         )
         self._first: float | None = None  # when the first message came, monotonic
-        self._display = _Display(self)
+        self._display = _Display(self, self._duration)
         self._diagnostics = Diagnostics(self, self._report)
         self._worker = Worker(self, self._record, "record")
         self._worker.start()
@@ -343,8 +353,9 @@ class Record(Node):
 class _Display:
     """Progress: one line that changes on a terminal, a line of log every five seconds elsewhere."""
 
-    def __init__(self, node: Record) -> None:
+    def __init__(self, node: Record, duration: float) -> None:
         self._node = node
+        self._of = f" of {duration:g}" if duration else ""
         self._console = Console(stderr=True)
         self._live = Live(console=self._console, auto_refresh=False, transient=True) if sys.stderr.isatty() else None
         self._every = 1.0 if self._live else 5.0
@@ -365,7 +376,7 @@ class _Display:
                 lost = f" lost {tap.lost}" if tap.lost else ""
                 parts.append(f"{self._node.shorten(tap.topic)} {rate:.1f} Hz{lost}")
         self._at = now
-        line = f"{self._node.elapsed(now):.0f} s   {'   '.join(parts) or 'waiting for messages'}"
+        line = f"{self._node.elapsed(now):.0f}{self._of} s   {'   '.join(parts) or 'waiting for messages'}"
         if self._live:
             self._live.update(Text(f"recording {line}", overflow="ellipsis", no_wrap=True), refresh=True)
         else:
@@ -429,30 +440,16 @@ def _remove_bag(path: Path) -> None:
     shutil.rmtree(path)
 
 
-def _arguments(argv: list[str]) -> Path:
-    try:
-        rest = remove_ros_args(["record", *argv])[1:]
-    except Exception:  # `run` meets it again and says it
-        rest = []
-    if options := [word for word in rest if word.startswith("-")]:
-        raise UserError(f"unknown argument '{options[0]}': parameters go behind --ros-args -p, see --help")
-    if len(rest) > 1:
-        raise UserError(f"one OUT only, not {' '.join(rest)}: see --help")
-    return Path(rest[0] if rest else f"{datetime.now():aeropend_%Y_%m_%d-%H_%M_%S}")
+def _out(words: list[str]) -> Path:
+    no_options(words)
+    if len(words) > 1:
+        raise UserError(f"one OUT only, not {' '.join(words)}: see --help")
+    return Path(words[0] if words else f"{datetime.now():aeropend_%Y_%m_%d-%H_%M_%S}")
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node."""
-    argv = sys.argv[1:] if args is None else args
-    if {"-h", "--help"} & set(argv):
-        print(USAGE.strip())
-        return 0
-    try:
-        out = _arguments(argv)
-    except UserError as error:
-        print(f"record: {error}", file=sys.stderr)
-        return 2
-    return run(lambda: Record(out), argv)
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point of `record`."""
+    return run(Record, args, USAGE, _out)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import shutil
 import sqlite3
 import sys
@@ -14,14 +15,28 @@ from pathlib import Path
 
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinitionFormat
 from rosbags.rosbag2.errors import WriterError
-from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from aeropend_ident.bag import Bag, RecordingError
 from aeropend_ident.msgtypes import learn
 from aeropend_ident.writer import BagWriter
+from aeropend_sim.command import EXIT_CODES, Parser
+from aeropend_sim.progress import Show, nothing, progress
 
 CHECKPOINT_MESSAGES = 20_000
+
+LONGEST_IDL = 100_000
+"""Characters of an IDL definition."""
+_IDL_TEXT = re.compile(r'"(?:\\.|[^"\\])*"|//[^\n]*|/\*.*?\*/', re.DOTALL)
+_IDL_ANNOTATION = re.compile(r"@\w+\s*\([^()]*\)")
+
+EXAMPLES = f"""examples:
+  recover my_bag
+  recover my_bag --out saved
+  recover my_bag/my_bag.mcap
+
+{EXIT_CODES}"""
 
 
 @dataclass(frozen=True)
@@ -43,12 +58,13 @@ class Recovered:
     left_out: tuple[str, ...]
 
 
-def recover(path: Path | str, out: Path | str | None = None) -> Recovered:
+def recover(path: Path | str, out: Path | str | None = None, show: Show = nothing) -> Recovered:
     """Write what can be read of a bag into a new one, of the same storage.
 
     Args:
         path: the broken bag; it is not changed.
         out: folder to make; PATH_recovered when left out.
+        show: is told which share of the messages is written.
 
     Raises:
         RecordingError: nothing can be recovered, `out` exists, or it cannot be written; nothing is left behind.
@@ -72,7 +88,7 @@ def recover(path: Path | str, out: Path | str | None = None) -> Recovered:
         raise RecordingError(f"{target} exists: name another folder with --out") from error
     try:
         writer.open()
-        left_out = _copy(bag, writer)
+        left_out = _copy(bag, writer, sum(counts.values()), show)
         writer.close()
     except (OSError, sqlite3.Error) as error:
         _discard(writer)
@@ -84,7 +100,7 @@ def recover(path: Path | str, out: Path | str | None = None) -> Recovered:
     return Recovered(target, kept, seconds, tuple(bag.problems), left_out)
 
 
-def _copy(bag: Bag, writer: BagWriter) -> tuple[str, ...]:
+def _copy(bag: Bag, writer: BagWriter, total: int, show: Show) -> tuple[str, ...]:
     """Write every message whose type can be had. Returns the topics left out."""
     typestore = get_typestore(Stores.ROS2_JAZZY)
     entered: dict[tuple[str, str], Connection | None] = {}
@@ -97,6 +113,7 @@ def _copy(bag: Bag, writer: BagWriter) -> tuple[str, ...]:
             writer.write(target, received, message)
         if number % CHECKPOINT_MESSAGES == 0:
             writer.checkpoint()
+            show(number / total)
     return tuple(topic for (topic, _), target in entered.items() if target is None)
 
 
@@ -108,18 +125,35 @@ def _enter(connection: Connection, writer: BagWriter, typestore: Typestore) -> C
             if connection.msgdef.format == MessageDefinitionFormat.MSG:
                 typestore.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
             elif connection.msgdef.format == MessageDefinitionFormat.IDL:
+                _check_idl(connection.msgdef.data)
                 typestore.register(get_types_from_idl(connection.msgdef.data))
             else:
                 learn(typestore, connection.msgtype)
-        except (LookupError, TypesysError):
+        except Exception:  # whatever the definition says, rosbags' parsers raise what their code raises
             return None
-    return writer.add_connection(
-        connection.topic,
-        connection.msgtype,
-        typestore=typestore,
-        serialization_format=connection.ext.serialization_format,
-        offered_qos_profiles=connection.ext.offered_qos_profiles,
-    )
+    try:
+        return writer.add_connection(
+            connection.topic,
+            connection.msgtype,
+            typestore=typestore,
+            serialization_format=connection.ext.serialization_format,
+            offered_qos_profiles=connection.ext.offered_qos_profiles,
+        )
+    except (OSError, sqlite3.Error):
+        raise
+    except Exception:  # a type that holds itself, for example
+        return None
+
+
+def _check_idl(text: str) -> None:
+    """Make sure that rosbags' parser comes to an end: each parenthesis in a constant takes it 30 times longer.
+
+    Raises:
+        ValueError: it would not.
+    """
+    bare = _IDL_ANNOTATION.sub("", _IDL_TEXT.sub("", text))
+    if len(text) > LONGEST_IDL or "(" in bare:
+        raise ValueError("an IDL definition that is long, or computes")
 
 
 def _discard(writer: BagWriter) -> None:
@@ -131,17 +165,18 @@ def _discard(writer: BagWriter) -> None:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="recover",
         description="Makes a proper bag of a recording that was broken off. The broken one stays as it is.",
-        epilog="examples:\n  recover my_bag\n  recover my_bag --out saved\n  recover my_bag/my_bag.mcap",
+        epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("bag", metavar="BAG", help="rosbag2 folder, or a bare .mcap or .db3 file")
     parser.add_argument("--out", metavar="DIR", help="folder to make (default: BAG_recovered)")
     options = parser.parse_args(args)
     try:
-        done = recover(options.bag, options.out)
+        with progress("recovering") as show:
+            done = recover(options.bag, options.out, show)
     except RecordingError as error:
         print(f"recover: {error}", file=sys.stderr)
         return 2

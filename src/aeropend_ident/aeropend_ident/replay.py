@@ -11,16 +11,15 @@ import heapq
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.utilities import remove_ros_args
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosDurability
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
@@ -29,7 +28,17 @@ from aeropend_ident.bag import Bag, RecordingError
 from aeropend_ident.msgtypes import message_class
 from aeropend_ident.recording import split_topic
 from aeropend_sim import interface
-from aeropend_sim.ros import Diagnostics, Setting, UserError, Worker, overrides, read_settings, run, usage
+from aeropend_sim.ros import (
+    Diagnostics,
+    Setting,
+    UserError,
+    Worker,
+    no_options,
+    overrides,
+    read_settings,
+    run,
+    usage,
+)
 
 HORIZON_NS = 1_000_000_000
 """Messages may lie in a bag this much out of order, ns."""
@@ -61,6 +70,7 @@ USAGE = usage(
         "replay my_bag --ros-args -p topics:=duty_command -r __ns:=/rig2",
     ],
     "  Topics keep the names they were recorded with. In a namespace (-r __ns:=/rig2) the rig's topics move into it.",
+    "BAG",
 )
 
 Event = tuple[int, Connection, bytes]
@@ -308,7 +318,8 @@ class Replay(Node):
 
     def _progress(self) -> Progress:
         console = Console(stderr=True)
-        columns = (TextColumn("replaying"), BarColumn(), TextColumn("{task.completed:.0f} of {task.total:.0f} s"))
+        columns = (TextColumn("replaying"), BarColumn(), TextColumn("{task.completed:.0f} of {task.total:.0f} s"),
+                   TimeRemainingColumn())
         looping = (TextColumn("replaying again and again, {task.completed:.0f} s"),)
         return Progress(
             *(looping if self._loop else columns), console=console, transient=True, disable=not sys.stderr.isatty()
@@ -330,30 +341,16 @@ def _qos_like(connection: Connection) -> QoSProfile:
     )
 
 
-def _arguments(argv: list[str]) -> Path:
-    try:
-        rest = remove_ros_args(["replay", *argv])[1:]
-    except Exception:  # `run` meets it again and says it
-        rest = argv[:1]
-    if options := [word for word in rest if word.startswith("-")]:
-        raise UserError(f"unknown argument '{options[0]}': parameters go behind --ros-args -p, see --help")
-    if len(rest) != 1:
-        raise UserError(f"name one BAG{', not ' + ' '.join(rest) if rest else ''}: see --help")
-    return Path(rest[0])
+def _bag(words: list[str]) -> Path:
+    no_options(words)
+    if len(words) != 1:
+        raise UserError(f"name one BAG{', not ' + ' '.join(words) if words else ''}: see --help")
+    return Path(words[0])
 
 
-def main(args: list[str] | None = None) -> int:
-    """Run the node."""
-    argv = sys.argv[1:] if args is None else args
-    if {"-h", "--help"} & set(argv):
-        print(USAGE.strip())
-        return 0
-    try:
-        path = _arguments(argv)
-    except UserError as error:
-        print(f"replay: {error}", file=sys.stderr)
-        return 2
-    return run(lambda: Replay(path), argv)
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point of `replay`."""
+    return run(Replay, args, USAGE, _bag)
 
 
 if __name__ == "__main__":

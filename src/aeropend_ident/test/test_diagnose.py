@@ -2,31 +2,25 @@
 """The command as a person runs it: a bag in, three files out, or one line that says why not."""
 
 import json
-import subprocess
-import sys
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import Command
 from rigs import BENCH, drawn_rig, steps
 
+from aeropend_ident.results import experiment
 from aeropend_sim import rig
+from aeropend_sim.excitation import Excitation
 from aeropend_sim.parameters import load
 
 KEYS = ["format", "bags", "model", "duration_s", "samples", "train_s", "held_out_s", "channels", "where", "which",
         "shrink", "notes", "seconds"]
 
 
-def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "aeropend_ident.diagnose", *map(str, arguments)], capture_output=True,
-                          text=True, check=False, timeout=280)
-
-
-def refused(*arguments: object) -> str:
-    result = run(*arguments)
-    assert (result.returncode, result.stdout) == (2, "")
-    assert len(result.stderr.strip().splitlines()) == 1, result.stderr
-    return result.stderr
+COMMAND = Command("aeropend_ident.diagnose")
+run, refused = COMMAND.run, COMMAND.refused
 
 
 @pytest.fixture(scope="module")
@@ -73,6 +67,9 @@ def test_results_are_not_overwritten_unasked(bag, tmp_path):
     (["BAG", "--jobs", "0"], "--jobs"),
     (["BAG", "--namespace", "/other"], "/other"),
     (["BAG", "--colour"], "--colour"),
+    (["BAG", "--test", "no_such_bag"], "no_such_bag"),
+    (["BAG", "--test", "BAG"], "fitted to"),
+    (["--each", "BAG", "--test", "no_such_bag"], "--each"),
 ])
 def test_a_wrong_command_line_is_one_line(bag, tmp_path, arguments, words):
     message = refused(*[bag if a == "BAG" else a for a in arguments], "--out", tmp_path / "out")
@@ -121,3 +118,62 @@ def test_the_preset_is_a_model_of_itself(tmp_path, bags):
     body = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert body["shrink"]["gap"] < 1.5 * body["shrink"]["floor"]
     assert np.isfinite(body["seconds"])
+
+
+def test_the_verdict_does_not_depend_on_the_number_of_threads(tmp_path, bags):
+    """One rig, two recordings: the same to the last bit."""
+    model = drawn_rig(13, {"coulomb_friction": {}})
+    paths = []
+    for seed in (13, 14):
+        duty = steps(8.0, seed)
+        columns, _ = rig.record(model, duty, seed)
+        paths.append(bags.write(tmp_path / f"bag{seed}", bags.content(len(duty), columns={**columns, "duty": duty})))
+    found = []
+    for jobs in (1, 3):
+        result = run(*paths, "--out", tmp_path / f"out{jobs}", "--jobs", jobs)
+        assert result.returncode == 0, result.stderr
+        body = json.loads((tmp_path / f"out{jobs}" / "diagnosis.json").read_text())
+        body.pop("seconds")
+        model_file = (tmp_path / f"out{jobs}" / "augmented.yaml").read_text().splitlines()
+        found.append((body, [line for line in model_file if line[0] != "#"]))
+    assert found[0] == found[1]
+
+
+def test_what_one_recording_says_is_shown_on_others(tmp_path, bags):
+    """Fitted on random steps, shown on a slow staircase: by the right amount, and by nothing for another rig."""
+    model = drawn_rig(15, {"coulomb_friction": {}})
+    other = drawn_rig(16, {"quadratic_drag": {"k": 3.0}})
+    stairs = Excitation("staircase", 20.0, duty_max=0.5).series()
+    paths = []
+    for name, of, duty in (("fitted", model, steps(20.0, 15)), ("same", model, stairs), ("other", other, stairs)):
+        columns, _ = rig.record(of, duty, len(paths))
+        paths.append(bags.write(tmp_path / name, bags.content(len(duty), columns={**columns, "duty": duty})))
+    fitted, same, different = paths
+    result = run(fitted, "--test", same, "--test", different, "--out", tmp_path / "out")
+    assert result.returncode == 0, result.stderr
+    body = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert list(body) == KEYS
+    assert body["bags"] == [str(fitted)]
+    first, second = body["shrink"]["across"]
+    assert set(first) == {"bag", "gap", "gap_after", "floor", "closed", "low", "high"}
+    assert (first["bag"], second["bag"]) == (str(same), str(different))
+    assert first["gap"] > 3.0 * first["floor"]
+    assert first["gap_after"] < 1.3 * first["floor"]
+    assert first["low"] <= first["closed"] <= first["high"] <= 1.0
+    assert first["low"] > 0.9
+    assert second["closed"] < 0.8
+    lines = [line for line in result.stdout.splitlines() if "not fitted to" in line]
+    assert [str(p) in line for p, line in zip((same, different), lines)] == [True, True]
+    assert f"{100 * first['gap']:.1f} %" in lines[0]
+    # what is fitted does not change by being shown
+    plain = run(fitted, "--out", tmp_path / "plain")
+    assert plain.returncode == 0, plain.stderr
+    alone = json.loads((tmp_path / "plain" / "diagnosis.json").read_text())
+    assert "across" not in alone["shrink"]
+    assert alone["which"] == body["which"]
+
+
+def test_the_advised_experiment_can_be_pasted_into_a_shell():
+    advice = {"why": "w", "excite": {"kind": "steps", "duration": 60.0, "sequence": [0.1, 0.5]}}
+    words = shlex.split(experiment(advice).removesuffix(" (w)"))
+    assert words == ["excite", "--ros-args", "-p", "kind:=steps", "-p", "duration:=60.0", "-p", "sequence:=[0.1, 0.5]"]

@@ -114,3 +114,13 @@ def test_the_augmented_model_runs_the_rig():
     result = diagnose(BENCH, [signals], 2)
     columns, _ = rig.record(result.augmented, signals.duty, 1)
     assert np.sqrt(np.mean((columns["theta"] - signals.theta) ** 2)) < 2.0 * signals.sigma["theta"]
+
+
+def test_a_motor_that_rests_all_along_is_no_reason_to_fail():
+    t, rest = np.arange(3000) * SAMPLE_PERIOD, np.zeros(3000)
+    noise = 2e-3 * np.random.default_rng(0).standard_normal(len(t))
+    gravity, damping = (BENCH.model[k] for k in ("mgd_over_J", "c_over_J"))
+    theta = 0.05 * np.exp(-0.5 * damping * t) * np.cos(np.sqrt(gravity - 0.25 * damping**2) * t) + noise
+    signals = from_arrays({"theta": theta, **dict.fromkeys(("omega", "i_a", "v_a", "duty"), rest)}, SAMPLE_PERIOD,
+                          BENCH.sensing)
+    assert diagnose(BENCH, [signals]).body["which"]["verdict"] == "none"

@@ -11,12 +11,15 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from blind import cases
 from rigs import BENCH, recorded
 
 from aeropend_ident.diagnose import document
-from aeropend_ident.gap import report
+from aeropend_ident.gap import curves, report, words
 from aeropend_ident.gap.diagnosis import diagnose
+from aeropend_ident.gap.signals import from_arrays
 from aeropend_sim.effects import CATALOGUE, PLACES
+from aeropend_sim.parameters import SAMPLE_PERIOD
 
 VOID = {"area", "base", "br", "col", "embed", "hr", "img", "input", "link", "meta", "source", "track", "wbr"}
 HOSTILE = "</script><script>alert('1')</script>\"><img src=x onerror=alert(2)>{{ 7 * 7 }}"
@@ -102,7 +105,14 @@ def two():
     return diagnose(BENCH, [recorded(12, {"coulomb_friction": {}}, duration=t) for t in (15.0, 18.0)], 2)
 
 
-@pytest.fixture(scope="module", params=["friction", "nominal", "several", "angle_only", "two"])
+@pytest.fixture(scope="module")
+def strange():
+    """Diagnose 24 s of a rig whose arm is braked while it rises only: no effect of the catalogue."""
+    _, columns = cases.draw("rig", "outside", ["one_way_drag"], "table", BENCH.model, BENCH.sensing, 1, 24.0)
+    return diagnose(BENCH, [from_arrays(columns, SAMPLE_PERIOD, BENCH.sensing)], 2)
+
+
+@pytest.fixture(scope="module", params=["friction", "nominal", "several", "angle_only", "two", "strange"])
 def page(request):
     diagnosis = request.getfixturevalue(request.param)
     bags = [f"bag_{k}" for k in range(len(diagnosis.signals))]
@@ -142,7 +152,8 @@ def test_everybody_can_read_it(page):
 def test_what_is_referred_to_is_there(page):
     assert set(page.ids.values()) == {1}
     wanted = [a["aria-labelledby"] for _, a, _ in page.tags if "aria-labelledby" in a]
-    wanted += [a["href"][1:] for a in page.all("a")] + [a["data-traces"] for a in page.all("figure")]
+    wanted += [a["href"][1:] for a in page.all("a")]
+    wanted += [a["data-traces"] for a in page.all("figure") if "data-traces" in a]
     assert set(wanted) <= set(page.ids)
 
 
@@ -169,10 +180,10 @@ def test_one_effect(friction):
     for place in PLACES:
         assert place in page.text("ol")
     body = friction.body
-    assert report.percent(body["where"]["share"]["arm"]).replace("\N{NO-BREAK SPACE}", " ") in page.text("ol")
+    assert words.percent(body["where"]["share"]["arm"]).replace("\N{NO-BREAK SPACE}", " ") in page.text("ol")
     for row in body["channels"].values():
         for key in ("gap", "gap_after", "floor"):
-            assert report.quantity(row[key], row["unit"]).replace("\N{NO-BREAK SPACE}", " ") in page.text("table")
+            assert words.quantity(row[key], row["unit"]).replace("\N{NO-BREAK SPACE}", " ") in page.text("table")
     for name in body["which"]["numbers"]:
         assert name in page.text("table")
 
@@ -202,6 +213,133 @@ def test_unknown(friction):
                                "in this part of the chain: arm.")
     assert "theta is off by 9.1 times the noise" in page.text("header")
     assert page.text("title") == "unknown effect · diagnose"
+
+
+def test_what_an_unknown_looks_like(strange):
+    unknown = strange.body["which"]["unknown"]
+    assert (strange.body["which"]["verdict"], unknown["place"]) == ("unknown", "arm")
+    page = Page(rendered(strange))
+    assert page.text("h1").endswith("in this part of the chain: arm.")
+    assert "#unknown" in [a["href"] for a in page.all("a")]
+    drawn = [a for a in page.all("path") if a.get("class") == "knots"]
+    assert len(drawn) == len(unknown["curves"])
+    beyond = sum(t > strange.signals[0].train * SAMPLE_PERIOD for c in unknown["curves"] if c["variable"] == "t"
+                 for t in c["at"])
+    assert sum(a["d"].count("M") for a in drawn) == sum(len(c["at"]) for c in unknown["curves"]) - beyond + bool(beyond)
+    names = [t for t in page.text("figure", "p").split("torque on the arm") if t]
+    assert names[0].strip().startswith(", as acceleration, rad/s² against the arm rate")
+    captions = page.text("figcaption")
+    assert captions.startswith("Peaks at")
+    assert captions.count(".") >= len(drawn)
+
+
+def test_an_unknown_beside_what_was_found(friction, strange):
+    unknown = {**strange.body["which"]["unknown"], "place": "rotor"}
+    page = Page(rendered(friction, unknown=unknown))
+    assert page.text("h1").startswith("The model lacks coulomb_friction")
+    assert "remains in this part of the chain: rotor." in page.text("header")
+    assert "unknown" in page.ids
+    assert "unknown" not in Page(rendered(friction)).ids
+
+
+def of(variable, at, value, unit="rad/s²"):
+    return {"variable": variable, "unit": unit, "at": [float(x) for x in at], "value": [float(v) for v in value]}
+
+
+def plain(text):
+    return text.replace("\N{NO-BREAK SPACE}", " ")
+
+
+FACTORS = curves.Factors(thrust=10.0, rate=0.5, current=0.4, step=0.3)
+NINE = np.linspace(-2.0, 2.0, 9)
+
+
+def test_curves_are_drawn_without_what_a_number_does():
+    drawn = curves.drawn({"place": "arm", "curves": [
+        of("theta", NINE / 4, 5.0 * NINE + 3.0),
+        of("theta_dot", NINE, -np.abs(NINE) - 2.0 * NINE + 7.0)]}, FACTORS, 49.0)
+    assert [c["plain"] for c in drawn["cells"]] == ["the arm rate", "the arm angle"]
+    first, second = (plain(c["words"]) for c in drawn["cells"])
+    assert first == ("Peaks at 0 rad/s² near 0 rad/s, from −2.0 rad/s² at −2.0 rad/s to −2.0 rad/s² at 2.0 rad/s; "
+                     "besides, a slope by −8.0 rad/s² in all, which the model's numbers may do as well.")
+    assert second == "Next to nothing; besides, a slope by 20 rad/s² in all, which the model's numbers may do as well."
+    heights = [float(p.split()[1]) for p in drawn["cells"][1]["curve"][1:].split("L")]
+    assert max(heights) - min(heights) <= 1.0
+
+
+def test_curves_that_are_multiplied_keep_their_slope():
+    late = [of(f"step of the duty, {k} samples ago", [0.0, 1.0], v, "V")
+            for k, v in enumerate(([-2.0], [0.0, -1.0], [-0.5]))]
+    slow = of("omega, slowly (share of the thrust)", 50.0 + NINE, -NINE / 20.0, "-")
+    share = curves.drawn({"place": "thrust", "curves": [slow]}, FACTORS, 49.0)
+    assert share["cells"][0]["term_unit"] == "%"
+    assert "falls from 0 % at 48 rad/s to −20 % at 52 rad/s" in plain(share["cells"][0]["said"])
+    steps = curves.drawn({"place": "actuator", "curves": late}, FACTORS, 49.0)
+    assert [c["plain"] for c in steps["cells"]] == ["samples after a step of the duty"]
+    assert steps["cells"][0]["knots"].count("M") == 3
+    assert steps["cells"][0]["term_unit"] == "V per unit of duty"
+
+
+def test_a_curve_over_time_ends_with_the_data():
+    made = curves.drawn({"place": "arm", "curves": [
+        of("t", [0.0, 20.0, 40.0, 60.0, 70.0], [1.0, 2.0, 4.0, 0.0, 0.0]), of("theta", [], [])]}, FACTORS, 49.0)
+    assert len(made["cells"]) == 1
+    assert plain(made["cells"][0]["words"]) == "Rises from 0 rad/s² at 0 s to 3.0 rad/s² at 49 s."
+    assert curves.drawn({"place": "arm", "curves": []}, FACTORS, 49.0) is None
+
+
+@pytest.mark.parametrize(("y", "text"), [
+    ([0, 0, 0, 0, 3, 3, 3, 3, 3], "rises from 0 V at −2.0 A to 3.0 V at 2.0 A, most of it between −0.50 A and 0 A"),
+    ([0, 1, 2, 1, 0, -1, -2, -1, 0], "goes up and down, highest at 2.0 V near −1.0 A, lowest at −2.0 V near 1.0 A"),
+    ([4, 3, 2, 1, 0, 1, 2, 3, 4], "dips at 0 V near 0 A, from 4.0 V at −2.0 A to 4.0 V at 2.0 A"),
+])
+def test_shapes_in_words(y, text):
+    assert plain(curves._words(NINE, np.array(y, dtype=float), "A", "V")) == text
+
+
+def test_regions_are_marked_where_the_misfit_is_drawn(several, nominal):
+    regions = several.body["where"]["regions"]
+    assert regions
+    page = Page(rendered(several))
+    marked = [a for a in page.all("rect") if a.get("class") == "range"]
+    assert len(marked) == len(regions)
+    assert all(0.0 <= float(a["x"]) <= float(a["x"]) + float(a["width"]) <= report.WIDTH + 0.2 for a in marked)
+    said = [a["aria-label"] for a in page.all("svg") if a.get("aria-label", "").startswith("Misfit")]
+    assert len(said) == 6
+    assert sum("stands out" in text for text in said) == len(regions)
+    if not nominal.body["where"]["regions"]:
+        assert "Misfit" not in rendered(nominal)
+
+
+def test_reasons_for_care(friction, angle_only):
+    def care(diagnosis, **which):
+        page = Page(rendered(diagnosis, **which))
+        return page.text("header", "div")
+
+    assert "Only 11 s were fitted" in care(friction)
+    assert "Not measured: rotor speed, armature current, armature voltage." in care(angle_only)
+    both = ["coulomb_friction", next(r["effect"] for r in friction.body["which"]["candidates"]
+                                     if r["effect"] not in {"coulomb_friction", "parameter_mismatch"})]
+    rows = [{**r, "found": r["effect"] in both, "probability": min(r["probability"], 0.8), "place": "arm"}
+            for r in friction.body["which"]["candidates"]]
+    unsure = care(friction, candidates=rows, effects=both)
+    assert f"Less sure than 95 %: {', '.join(both)}." in unsure
+    assert f"In the same part of the chain: {', '.join(both)}." in unsure
+    numbers = friction.body["which"]["numbers"]
+    moved = {**numbers, "R_a": {"nominal": 1.0, "value": 1.2, "low": 1.1, "high": 1.3}}
+    assert "without being claimed: R_a. Check in the model file." in care(friction, numbers=moved)
+    still = replace(friction.signals[0], duty=np.full(len(friction.signals[0]), 0.3))
+    assert "The duty varied by 0.0 only" in care(replace(friction, signals=[still]))
+    noted = replace(friction.signals[0], notes=("not measured: v_a", "2 samples are missing in 1 gap"))
+    assert "1 note tells" in care(replace(friction, signals=[noted]))
+    assert "note" not in care(friction)
+    open_ = {**friction.body["shrink"], "closed": 0.6}
+    assert "No more than 60 % of the gap closes" in care(replace(friction, body={**friction.body, "shrink": open_}))
+
+
+def test_a_good_recording_needs_no_care(friction):
+    long = replace(friction.signals[0], period=4.0 * SAMPLE_PERIOD)
+    assert "with care" not in rendered(replace(friction, signals=[long]))
 
 
 def test_a_number_that_is_off(friction):
@@ -286,7 +424,7 @@ def test_a_long_recording_stays_small(friction):
     (-12345.6, "", "−12300"), (0.0, "A", "0.00 A"), (2.0, "-", "2.00"), (None, "A", "–"), (math.nan, "A", "–"),
 ])
 def test_quantities(value, unit, text):
-    assert report.quantity(value, unit).replace("\N{NO-BREAK SPACE}", " ") == text
+    assert words.quantity(value, unit).replace("\N{NO-BREAK SPACE}", " ") == text
 
 
 @pytest.mark.parametrize(("numbers", "texts"), [
@@ -298,7 +436,7 @@ def test_quantities(value, unit, text):
     ((1.0, math.nan, math.inf), ("1.00", "– to –")),
 ])
 def test_intervals(numbers, texts):
-    assert tuple(t.replace("\N{NO-BREAK SPACE}", " ") for t in report.interval(*numbers)) == texts
+    assert tuple(t.replace("\N{NO-BREAK SPACE}", " ") for t in words.interval(*numbers)) == texts
 
 
 @pytest.mark.parametrize(("share", "text"), [
@@ -306,12 +444,12 @@ def test_intervals(numbers, texts):
     (0.0, "0 %"), (-0.2, "−20 %"), (None, "–"),
 ])
 def test_percents(share, text):
-    assert report.percent(share).replace("\N{NO-BREAK SPACE}", " ") == text
+    assert words.percent(share).replace("\N{NO-BREAK SPACE}", " ") == text
 
 
 def test_no_probability_is_certain():
-    assert report.probability(1.0).startswith(">")
-    assert report.probability(0.0).startswith("<")
+    assert words.probability(1.0).startswith(">")
+    assert words.probability(0.0).startswith("<")
 
 
 def test_every_stretch_keeps_its_least_and_greatest():

@@ -42,6 +42,32 @@ def test_false_periods_are_told_from_true_ones():
     assert (pulses.false & ~truly).sum() < 0.02 * len(truly)
 
 
+@pytest.mark.parametrize("stop", [False, True])
+def test_a_false_period_is_told_where_the_rotor_starts(stop):
+    duty = np.repeat([0.3, 0.0, 0.35], [3000, 3500, 2000]) if stop else np.repeat([0.0, 0.3], [500, 3000])
+    read, _ = rig.record(BENCH, duty, 4)
+    true = find_pulses(read["omega"], SAMPLE_PERIOD, BENCH.sensing)
+    assert not true.false.any()
+    first = int(true.index[np.flatnonzero(true.index > (6500 if stop else 0))[0]])
+    changes = np.flatnonzero(np.diff(read["omega"])) + 1
+    second = int(changes[changes > first][0])
+    assert read["omega"][first - 1] == 0.0
+    read["omega"][first:second] *= 2.0
+    found = find_pulses(read["omega"], SAMPLE_PERIOD, BENCH.sensing)
+    assert found.index[found.false].tolist() == [first]
+
+
+def test_steps_of_the_duty_between_slow_samples_leave_the_speed_unsure():
+    read, truth = rig.record(BENCH, steps(40.0, 6), 6)
+    slow = find_pulses(read["omega"][::2], 2.0 * SAMPLE_PERIOD, BENCH.sensing)
+    fast = find_pulses(read["omega"], SAMPLE_PERIOD, BENCH.sensing)
+    slope = np.abs(np.gradient(truth["omega"], SAMPLE_PERIOD))
+    steep = slope[2 * slow.index] > 200.0
+    assert steep.sum() > 20
+    assert np.median(slow.sigma[steep] / (slope[2 * slow.index] * SAMPLE_PERIOD)[steep]) > 0.5
+    assert np.median(fast.sigma[slope[fast.index] > 200.0]) < 0.5 * np.median(slow.sigma[steep])
+
+
 def test_a_missing_sample_keeps_its_place():
     data = columns()
     for name in data:
@@ -79,6 +105,43 @@ def test_a_channel_that_never_changes_is_left_out_and_said():
     signals = from_arrays(columns(i_a=np.full(2941, 0.3)), SAMPLE_PERIOD, BENCH.sensing)
     assert not signals.has("i_a")
     assert any("i_a is 0.3 A all the time" in note for note in signals.notes)
+
+
+@pytest.mark.parametrize(("channel", "limit"), [("theta", 0.3), ("i_a", 0.4), ("v_a", 1.0)])
+def test_readings_at_the_end_of_a_range_are_left_out_and_said(channel, limit):
+    data = columns(20.0)
+    clipped = data[channel] >= limit
+    assert clipped.mean() > 0.02
+    signals = from_arrays({**data, channel: np.minimum(data[channel], limit)}, SAMPLE_PERIOD, BENCH.sensing)
+    np.testing.assert_array_equal(np.isnan(signals.channel(channel)), clipped)
+    assert [note for note in signals.notes if note.startswith(f"{channel} sits at {limit:g}")
+            and f"{100.0 * clipped.mean():.1f} %" in note]
+    for other in {"theta", "omega", "i_a", "v_a"} - {channel}:
+        np.testing.assert_array_equal(signals.channel(other), data[other])
+
+
+@pytest.mark.parametrize("channel", ["theta", "omega", "i_a", "v_a"])
+def test_readings_that_jump_out_are_left_out_and_counted(channel):
+    data = columns(20.0)
+    hit = np.arange(500, len(data["duty"]), 700)
+    data[channel] = data[channel].copy()
+    data[channel][hit] += 3.0 * np.ptp(data[channel])
+    signals = from_arrays(data, SAMPLE_PERIOD, BENCH.sensing)
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(signals.channel(channel))), hit)
+    assert f"{channel}: {len(hit)} single readings jump out and are left out" in signals.notes
+
+
+def test_nothing_is_left_out_of_a_sound_recording():
+    data = columns(20.0)
+    signals = from_arrays(data, SAMPLE_PERIOD, BENCH.sensing)
+    assert signals.notes == ()
+    for channel in ("theta", "omega", "i_a", "v_a"):
+        np.testing.assert_array_equal(signals.channel(channel), data[channel])
+
+
+def test_an_angle_that_stays_is_no_ground_for_a_verdict():
+    with pytest.raises(RecordingError, match="stuck"):
+        from_arrays(columns(theta=np.full(2941, 0.3)), SAMPLE_PERIOD, BENCH.sensing)
 
 
 def test_lost_samples_do_not_make_true_periods_false():

@@ -7,14 +7,16 @@ signal that the part before it gives, corrected by what that description still l
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.gap.signals import Signals
 from aeropend_sim import actuator, dynamics, sensing
+from aeropend_sim.effects import CATALOGUE
 from aeropend_sim.parameters import Model
 
 Array = NDArray[np.float64]
@@ -35,21 +37,30 @@ PLACE_OF_NUMBER = {
 """Where in the chain a number of the model lives."""
 
 
+DELAY = "command_delay.delay"
+"""The one value of the actuator that acts between samples, where only the motor shows it."""
+
 RAN_AWAY = 1e9
 """What the difference to a simulation that is not finite counts as."""
 
 
 def with_values(model: Model, values: Values) -> Model:
-    """The model with these values: `R_a` is a number, `coulomb_friction.accel` an effect's; `initial.*` is left out."""
-    numbers = dict(model.model)
+    """The model with these values.
+
+    `R_a` is a number, `coulomb_friction.accel` an effect's, `sensing.angle_filter_tau` the measurement chain's;
+    `initial.*` is left out.
+    """
+    numbers, measuring = dict(model.model), dict(model.sensing)
     effects = {k: dict(v) for k, v in model.effects.items()}
     for name, value in values.items():
         owner, _, parameter = name.partition(".")
         if not parameter:
             numbers[name] = value
+        elif owner == "sensing":
+            measuring[parameter] = value
         elif owner != "initial":
             effects.setdefault(owner, {})[parameter] = value
-    return Model(model.name, numbers, model.sensing, effects)
+    return Model(model.name, numbers, measuring, effects)
 
 
 @dataclass
@@ -60,17 +71,29 @@ class Chain:
         model: the nominal model. signals: the recording.
         voltage: (N,) V, measured voltage without its noise; input of the motor.
         speed: (N,) rad/s, measured speed between its pulses; input of the arm.
+        current: (N,) A, as measured, the nominal model's where it is missing.
+        described, beyond: the values that describe the voltage, and what (N,) they leave of it.
     """
 
     model: Model
     signals: Signals
     voltage: Array
     speed: Array
+    current: Array
+    described: dict[str, float] = field(default_factory=dict)
+    beyond: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def cut(cls, model: Model, signals: Signals) -> Chain:
         """The chain with the nominal model's description of its inner signals; `feed_*` replace them."""
-        chain = cls(model, signals, np.zeros(len(signals)), np.zeros(len(signals)))
+        none = np.zeros(len(signals))
+        p = signals.pulses
+        if p is not None and signals.has("v_a"):  # the timing of a slow pulse is surer than the voltage that drives it
+            unsure = signals.sigma["v_a"] * math.sqrt(len(BLOCKS["actuator"]) / signals.train) / model.model["K_e"]
+            signals = replace(signals, pulses=replace(p, sigma=np.hypot(p.sigma, unsure)))
+        chain = cls(model, signals, none, none, none)
+        chain.feed_motor({})
+        chain.current = np.where(np.isfinite(signals.i_a), signals.i_a, chain.motor({})[0])
         chain.feed_motor({})
         chain.feed_arm({})
         return chain
@@ -79,9 +102,14 @@ class Chain:
 
     def actuator(self, values: Values) -> Array:
         """Voltage (N,) as it would be read."""
+        return self._voltage(values, actuator.sampled_voltage)
+
+    def _voltage(self, values: Values, of: Callable[..., Array]) -> Array:
         s, m = self.signals, with_values(self.model, values)
-        v = actuator.acting_voltage(m.numbers(), s.duty, m.effects, s.period, before=float(s.duty[0]))
-        v = v - m.effects.get("supply_sag", {}).get("r_supply", 0.0) * np.nan_to_num(s.i_a)
+        n = m.numbers()
+        before = float(actuator.duty(n, s.v_a[0]) if np.isfinite(s.v_a[0]) else s.duty[0])
+        v = of(n, s.duty, m.effects, s.period, before=before)
+        v = v - m.effects.get("supply_sag", {}).get("r_supply", 0.0) * self.current
         return v + m.effects.get("voltage_offset", {}).get("bias", 0.0)
 
     def actuator_residuals(self, values: Values) -> dict[str, Array]:
@@ -89,34 +117,56 @@ class Chain:
         s = self.signals
         return {"v_a": self._train(s.v_a, self.actuator(values), s.after_unseen) / s.sigma["v_a"]}
 
+    def likeliest_delay(self, values: Values) -> float:
+        """The `command_delay` (s) that fits the voltage best, in the middle of the period in which all look alike."""
+        high = CATALOGUE["command_delay"].parameters["delay"].high
+        tried = (np.arange(math.floor(high / self.signals.period)) + 0.5) * self.signals.period
+        errors = [sum(float(np.mean(r * r)) for r in
+                      self.actuator_residuals({**values, DELAY: d}).values()) for d in tried]
+        return float(tried[int(np.argmin(errors))])
+
     def feed_motor(self, values: Values) -> None:
         """Take the voltage that feeds the motor from the measured one, described by the actuator with these values."""
         s = self.signals
-        v = self.actuator(values)
+        self.described, self.beyond = dict(values), np.zeros(len(s))
         if s.has("v_a"):
-            v = v + structure(s.v_a - v, round(0.05 / s.period), s.sigma["v_a"])
-            early = np.arange(len(s)) < s.after_unseen
-            v = np.where(early & np.isfinite(s.v_a), s.v_a, v)
-        self.voltage = v
+            self.beyond = structure(s.v_a - self.actuator(values), round(0.05 / s.period), s.sigma["v_a"])
+        self.voltage = self._voltage_fed({})
+
+    def _voltage_fed(self, values: Values) -> Array:
+        """What feeds the motor; a delay in `values` says when in its hold a voltage changed."""
+        s = self.signals
+        late = {k: x for k, x in values.items() if k == DELAY}
+        acting = {**self.described, **late}
+        v = self._voltage(acting, actuator.acting_voltage) + self.beyond
+        delay = self.valued(acting).effects.get("command_delay", {}).get("delay", 0.0)
+        early = np.arange(len(s)) < math.floor(delay / s.period + 1e-9)  # set by duties from before the recording
+        return np.where(early & np.isfinite(s.v_a), s.v_a, v)
 
     # --- motor: voltage -> current, speed
 
-    def motor(self, values: Values) -> tuple[Array, Array, Array]:
-        """Current, speed and rotor angle (N,) for the voltage measured."""
+    def motor(self, values: Values, stop: int | None = None) -> tuple[Array, Array, Array]:
+        """Current, speed and rotor angle for the voltage measured, (N,) or up to sample `stop`."""
         m = with_values(self.model, values)
         # what lies before the terminals is in the voltage already
         effects = {k: p for k, p in m.effects.items() if k != "supply_sag"}
         bias = m.effects.get("voltage_offset", {}).get("bias", 0.0)
         m = m.with_effects(effects)
-        state = dynamics.State(i_a=values.get("initial.i_a", 0.0), omega=values.get("initial.omega", 0.0))
-        out = np.empty((3, len(self.signals)))
-        dynamics.run_motor(self.voltage - bias, state, *dynamics.prepare(m, self.signals.period), out)
+        first = float(self.signals.i_a[0]) if np.isfinite(self.signals.i_a[0]) else 0.0
+        state = dynamics.State(i_a=first, omega=values.get("initial.omega", 0.0))
+        if not self.signals.has("v_a"):  # nothing to cut at: from the duty
+            voltage = self._voltage(values, actuator.acting_voltage)
+        else:
+            voltage = self._voltage_fed(values) if DELAY in values else self.voltage
+        voltage = voltage[:stop] - bias
+        out = np.empty((3, len(voltage)))
+        dynamics.run_motor(voltage, state, *dynamics.prepare(m, self.signals.period), out)
         return out[0], out[1], out[2]
 
     def motor_residuals(self, values: Values) -> dict[str, Array]:
         """Residuals of current and speed over the training part, in units of their noise."""
         s = self.signals
-        i_a, omega, angle = self.motor(values)
+        i_a, omega, angle = self.motor(values, s.train)
         residuals = {}
         if s.has("i_a"):
             m = with_values(self.model, values).effects
@@ -146,20 +196,35 @@ class Chain:
 
     # --- arm: speed -> angle
 
-    def arm(self, values: Values) -> Array:
-        """Angle (N,) as it would be read, before noise and quantisation, for the speed measured."""
-        s, m = self.signals, with_values(self.model, values)
+    def valued(self, values: Values) -> Model:
+        """The model with these values."""
+        return with_values(self.model, values)
+
+    def arm(self, values: Values, stop: int | None = None) -> Array:
+        """Angle as it would be read, before noise and quantisation, for the speed measured; (N,) or up to `stop`."""
+        theta, rate = self.arm_motion(values, stop)
+        return sensing.angle_reading(theta, rate, sensing.prepare(self.valued(values), self.signals.period))
+
+    def arm_motion(self, values: Values, stop: int | None = None) -> tuple[Array, Array]:
+        """True angle and angular rate for the speed measured, (N,) or up to sample `stop`."""
+        s, m = self.signals, self.valued(values)
         n = m.numbers()
-        state = dynamics.State(omega=float(self.speed[0]), theta=values.get("initial.theta", 0.0),
+        cut = s.has("omega") or s.has("i_a")
+        if not cut and not s.duty.any() and "initial.omega" not in values and actuator.voltage(n, 0.0) == 0.0:
+            speed = np.zeros(len(s))[:stop]  # a rotor that stands
+        else:
+            speed = self.speed[:stop] if cut else np.maximum(self.motor(values, stop)[1], 0.0)
+        state = dynamics.State(omega=float(speed[0]), theta=values.get("initial.theta", 0.0),
                                theta_dot=values.get("initial.theta_dot", 0.0),
-                               thrust=float(actuator.thrust(n, self.speed[0])))
-        out = np.empty((2, len(s)))
-        dynamics.run_arm(self.speed, state, *dynamics.prepare(m, s.period), out)
-        return sensing.angle_reading(out[0], out[1], sensing.prepare(m, s.period))
+                               thrust=float(actuator.thrust(n, speed[0])))
+        out = np.empty((2, len(speed)))
+        dynamics.run_arm(speed, state, *dynamics.prepare(m, s.period), out)
+        return out[0], out[1]
 
     def arm_residuals(self, values: Values) -> dict[str, Array]:
         """Residual of the angle over the training part, in units of its noise."""
-        return {"theta": self._train(self.signals.theta, self.arm(values)) / self.signals.sigma["theta"]}
+        s = self.signals
+        return {"theta": self._train(s.theta, self.arm(values, s.train)) / s.sigma["theta"]}
 
     def residuals(self, block: str) -> Callable[[Values], dict[str, Array]]:
         """The residual function of a block by name."""
@@ -200,6 +265,11 @@ class Chains:
                 chain.feed_motor(self.own(values, k))
             elif block == "motor":
                 chain.feed_arm(self.own(values, k))
+
+    @property
+    def recordings(self) -> list[Signals]:
+        """What was recorded, in the order of `each`."""
+        return [chain.signals for chain in self.each]
 
     def named(self) -> Iterator[tuple[str, Signals]]:
         """For each recording the suffix of its names, and its signals."""

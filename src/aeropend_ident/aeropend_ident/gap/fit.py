@@ -137,7 +137,8 @@ class Search:
 
     def jacobian(self) -> Array:
         """Derivative of the stacked residuals by every unknown, one row an unknown."""
-        return np.array([self.column(j) for j in range(len(self.z))]).reshape(len(self.z), -1)
+        rows = sum(len(self.current[k]) for k in self.weight)
+        return np.array([self.column(j) for j in range(len(self.z))]).reshape(len(self.z), rows)
 
     def improve(self, steps: int) -> Array:
         """Levenberg-Marquardt steps with the weights as they are; returns the information matrix, prior included."""
@@ -162,7 +163,7 @@ class Search:
                     damping *= 0.2
                     break
                 damping *= 8.0
-            if gained < 1e-2 + 1e-4 * cost:
+            if gained < 1e-2 + 1e-4 * max(cost - sum(self.independent.values()), 0.0):
                 break
         return information
 

@@ -20,6 +20,11 @@ Array = NDArray[np.float64]
 STEP = 0.01
 """s between the residuals that the filter takes: the arm is slow."""
 
+NOTHING = np.empty((0, 18))
+
+FOLDS = 10
+"""Stretches of time, each predicted from the others."""
+
 
 @dataclass(frozen=True)
 class Gust:
@@ -44,43 +49,76 @@ class Gust:
 
 @njit(cache=True, nogil=True)
 def _filter(r: Array, stiffness: Array, damping: float, h: float, noise: float, sigma: float, tau: float,
-            torque: Array, innovations: Array) -> float:
-    """Kalman filter and Rauch-Tung-Striebel smoother over (δ, δ̇, w); returns the log likelihood."""
-    n = r.shape[0]
-    xs, ps = np.zeros((n, 3)), np.zeros((n, 3, 3))
-    xp, pp = np.zeros((n, 3)), np.zeros((n, 3, 3))
-    fs = np.zeros((n, 3, 3))
-    x, p = np.zeros(3), np.diag(np.array([noise * noise, 0.01, sigma * sigma]))
+            innovations: Array, kept: Array) -> float:
+    """Kalman filter over (δ, δ̇, w); returns the log likelihood.
+
+    Args:
+        r, stiffness: (M,). innovations: (M,), filled, in units of their standard deviation.
+        kept: (M, 18) or (0, 18), filled with what the smoother needs: the state and covariance (row-wise) after each
+            measurement, and the state and covariance before it.
+    """
+    x0 = x1 = x2 = 0.0
+    p00, p01, p02, p11, p12, p22 = noise * noise, 0.0, 0.0, 0.01, 0.0, sigma * sigma
     decay = math.exp(-h / tau)
     q = sigma * sigma * (1.0 - decay * decay)
     total = 0.0
-    for k in range(n):
+    for k in range(r.shape[0]):
         if k > 0:
-            a = np.array([[0.0, 1.0, 0.0], [-stiffness[k], -damping, 1.0], [0.0, 0.0, 0.0]])
-            f = np.eye(3) + h * a + 0.5 * h * h * (a @ a)
-            f[2, 2] = decay
-            x = f @ x
-            p = f @ p @ f.T
-            p[2, 2] += q
-            fs[k] = f
-        xp[k], pp[k] = x, p
+            a, b, c, d, e, f = transition(stiffness[k], damping, h)
+            x0, x1, x2 = a * x0 + b * x1 + c * x2, d * x0 + e * x1 + f * x2, decay * x2
+            s00, s01, s02 = a * p00 + b * p01 + c * p02, a * p01 + b * p11 + c * p12, a * p02 + b * p12 + c * p22
+            s10, s11, s12 = d * p00 + e * p01 + f * p02, d * p01 + e * p11 + f * p12, d * p02 + e * p12 + f * p22
+            p00, p01, p02 = s00 * a + s01 * b + s02 * c, s00 * d + s01 * e + s02 * f, s02 * decay
+            p11, p12, p22 = s10 * d + s11 * e + s12 * f, s12 * decay, p22 * decay * decay + q
+        if len(kept):
+            kept[k, 9:18] = x0, x1, x2, p00, p01, p02, p11, p12, p22
         if not math.isnan(r[k]):
-            s = p[0, 0] + noise * noise
-            e = r[k] - x[0]
-            gain = p[:, 0].copy() / s
-            x = x + gain * e
-            p = p - np.outer(gain, p[0, :].copy())
-            total -= 0.5 * (math.log(s) + e * e / s)
-            innovations[k] = e / math.sqrt(s)
+            s = p00 + noise * noise
+            e0 = r[k] - x0
+            g0, g1, g2 = p00 / s, p01 / s, p02 / s
+            x0, x1, x2 = x0 + g0 * e0, x1 + g1 * e0, x2 + g2 * e0
+            p11, p12, p22 = p11 - g1 * p01, p12 - g1 * p02, p22 - g2 * p02
+            p00, p01, p02 = p00 - g0 * p00, p01 - g0 * p01, p02 - g0 * p02
+            total -= 0.5 * (math.log(s) + e0 * e0 / s)
+            innovations[k] = e0 / math.sqrt(s)
         else:
             innovations[k] = 0.0
-        xs[k], ps[k] = x, p
-    torque[n - 1] = xs[n - 1, 2]
-    for k in range(n - 2, -1, -1):
-        g = ps[k] @ fs[k + 1].T @ np.linalg.inv(pp[k + 1] + 1e-15 * np.eye(3))
-        xs[k] = xs[k] + g @ (xs[k + 1] - xp[k + 1])
-        torque[k] = xs[k, 2]
+        if len(kept):
+            kept[k, :9] = x0, x1, x2, p00, p01, p02, p11, p12, p22
     return total
+
+
+@njit(cache=True)
+def transition(stiffness: float, damping: float, h: float) -> tuple[float, float, float, float, float, float]:
+    """First two rows of the transition of (δ, δ̇, w) over h, to second order."""
+    half = 0.5 * h * h
+    return (1.0 - half * stiffness, h - half * damping, half,
+            -h * stiffness + half * damping * stiffness, 1.0 - h * damping + half * (damping * damping - stiffness),
+            h - half * damping)
+
+
+@njit(cache=True, nogil=True)
+def _smooth(kept: Array, stiffness: Array, damping: float, h: float, tau: float, torque: Array) -> None:
+    """Rauch-Tung-Striebel smoother; fills the torque (M,)."""
+    n = kept.shape[0]
+    x = kept[n - 1, :3].copy()
+    torque[n - 1] = x[2]
+    f = np.zeros((3, 3))
+    f[2, 2] = math.exp(-h / tau)
+    for k in range(n - 2, -1, -1):
+        f[0, 0], f[0, 1], f[0, 2], f[1, 0], f[1, 1], f[1, 2] = transition(stiffness[k + 1], damping, h)
+        gain = symmetric(kept[k, 3:9]) @ f.T @ np.linalg.inv(symmetric(kept[k + 1, 12:18]) + 1e-15 * np.eye(3))
+        x = kept[k, :3] + gain @ (x - kept[k + 1, 9:12])
+        torque[k] = x[2]
+
+
+@njit(cache=True)
+def symmetric(p: Array) -> Array:
+    """The matrix (3, 3) of an upper triangle (6,)."""
+    out = np.empty((3, 3))
+    out[0, 0], out[0, 1], out[0, 2], out[1, 1], out[1, 2], out[2, 2] = p[0], p[1], p[2], p[3], p[4], p[5]
+    out[1, 0], out[2, 0], out[2, 1] = p[1], p[2], p[4]
+    return out
 
 
 def fit_gust(residual: Array, theta: Array, gravity: float, damping: float, noise: float, period: float) -> Gust:
@@ -101,8 +139,8 @@ def fit_gust(residual: Array, theta: Array, gravity: float, damping: float, nois
     h, sd = every * period, noise / math.sqrt(every)
     torque, innovations = np.zeros(n), np.zeros(n)
 
-    def cost(z: Array) -> float:
-        return -_filter(r, stiffness, damping, h, sd, math.exp(z[0]), math.exp(z[1]), torque, innovations)
+    def cost(z: Array, kept: Array = NOTHING) -> float:
+        return -_filter(r, stiffness, damping, h, sd, math.exp(z[0]), math.exp(z[1]), innovations, kept)
 
     size = float(np.nanstd(r)) * (gravity + 1.0)
     best = min((minimize(cost, [math.log(max(size, 1e-6)), math.log(tau)], method="Nelder-Mead",
@@ -118,17 +156,29 @@ def fit_gust(residual: Array, theta: Array, gravity: float, damping: float, nois
     known = r[np.isfinite(r)]
     white = max(float(np.mean(known**2)), sd**2)
     without = -0.5 * len(known) * (math.log(white) + float(np.mean(known**2)) / white)
-    cost(z)
+    kept = np.empty((n, 18))
+    cost(z, kept)
+    _smooth(kept, stiffness, damping, h, math.exp(z[1]), torque)
     e = innovations
     whiteness = float(np.mean(e[1:] * e[:-1]) / max(float(np.mean(e * e)), 1e-300))
     return Gust(math.exp(z[0]), math.exp(z[1]), width[0], width[1], -best.fun - without, torque.copy(), index,
                 whiteness)
 
 
-def follows_state(torque: Array, columns: list[Array]) -> float:
-    """Share of the torque's variance (0..1) that a linear combination of columns (each (M,)) explains."""
-    a = np.column_stack([np.ones(len(torque)), *columns])
+def follows_state(torque: Array, columns: Array) -> float:
+    """Share of the torque's variance (up to 1) that a linear combination of columns predicts where it was not fitted.
+
+    Args:
+        torque: (M,). columns: (M, K).
+    """
+    a = np.column_stack([np.ones(len(torque)), columns])
     a = a / np.maximum(np.linalg.norm(a, axis=0), 1e-12)
-    fitted = a @ np.linalg.lstsq(a, torque, rcond=1e-8)[0]
+    fold = np.arange(len(torque)) * FOLDS // len(torque)
+    error = np.empty(len(torque))
+    for k in range(FOLDS):
+        out = fold == k
+        x = a[~out]
+        weights = np.linalg.solve(x.T @ x + 1e-3 * np.eye(a.shape[1]), x.T @ torque[~out])
+        error[out] = torque[out] - a[out] @ weights
     total = float(np.sum((torque - torque.mean()) ** 2))
-    return 1.0 - float(np.sum((torque - fitted) ** 2)) / total if total > 0.0 else 0.0
+    return 1.0 - float(np.sum(error**2)) / total if total > 0.0 else 0.0

@@ -6,7 +6,6 @@ from __future__ import annotations
 import base64
 import math
 import platform
-import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
@@ -17,9 +16,12 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 
+from aeropend_ident.gap import curves
 from aeropend_ident.gap.chain import smooth
+from aeropend_ident.gap.curves import HEIGHT, WIDTH
 from aeropend_ident.gap.diagnosis import Diagnosis
 from aeropend_ident.gap.signals import CHANNELS, Signals
+from aeropend_ident.gap.words import ends, exact, interval, marks, minus, percent, probability, quantity, with_unit
 from aeropend_sim.effects import CATALOGUE, PARAMETER_MISMATCH, PLACES
 from aeropend_sim.parameters import PARAMETERS
 
@@ -34,6 +36,9 @@ VARIABLES = {
 
 SIGNAL_AFTER = dict(zip(PLACES, ("v_a", "i_a", "omega", "f", "theta", "reading"), strict=True))
 """What each part of the chain hands on."""
+
+AGAINST = ("theta", "theta_dot", "omega", "i_a", "duty", "t")
+"""What errors are drawn against: the variables of the regions."""
 
 OFF = 0.05
 """Relative shift of a number that is worth a mark."""
@@ -51,8 +56,21 @@ ZOOM_VALUES = 250_000
 """Values kept for zooming, over all traces (2.7 bytes each)."""
 
 BINS = 24
-WIDTH, HEIGHT = 1600, 400
-"""Units of a drawing, stretched to whatever size the page gives it."""
+
+RANDOM = {"gust", "speed_spikes"}
+"""What is found by its statistics: no model predicts it, so its gap stays open."""
+
+ELECTRICAL, MECHANICAL = {"electrical", "rotor"}, {"thrust", "arm", "sensing"}
+"""Places that no measured signal parts."""
+
+CLOSED = 0.9
+"""Share of the gap below which a claim that something was found is to be taken with care."""
+
+SHORT = 30.0
+"""s of data below which little can have happened in it."""
+
+CALM = {"duty": 0.25, "theta": 0.2}
+"""Range of a signal (1, rad) below which most effects hardly show."""
 
 
 def render(diagnosis: Diagnosis, document: Mapping[str, object], command: str) -> str:
@@ -81,94 +99,10 @@ def render(diagnosis: Diagnosis, document: Mapping[str, object], command: str) -
         places=_places(doc, candidates), regions=[_region(r) for r in doc["where"]["regions"]],
         shown=shown, others=[c for c in candidates if c not in shown],
         experiment=_experiment(doc["which"].get("next_experiment")),
-        numbers=numbers, reach=reach, off=f"{100.0 * OFF:g}",
-        traces=_traces(diagnosis, doc), residuals=_residuals(diagnosis, doc))
-
-
-# --- numbers as a person reads them
-
-def quantity(value: float | None, unit: str = "", digits: int = 3) -> str:
-    """A number to some significant digits with its unit: `0.0320 rad`, `1.78 × 10⁻⁵ kg·m²`, or a dash for none."""
-    if value is None or not math.isfinite(value):
-        return "–"
-    exponent = _exponent(value)
-    text = _fixed(value, exponent, digits - 1 - _magnitude(value) + exponent)
-    return _with_unit(text + _power(exponent), unit)
-
-
-def exact(value: float) -> str:
-    """A number as it was given, to six digits: `43629`, `6.8 × 10⁻⁴`."""
-    if not math.isfinite(value):
-        return "–"
-    exponent = _exponent(value)
-    return f"{value / 10.0**exponent:.6g}".replace("-", "−") + _power(exponent)
-
-
-def interval(value: float, low: float, high: float) -> tuple[str, str]:
-    """A value and its interval to the digits that the interval leaves certain: `0.799`, `0.798 to 0.801`."""
-    if not all(map(math.isfinite, (value, low, high))):
-        return quantity(value), f"{quantity(low)} to {quantity(high)}"
-    exponent = _exponent(max((value, low, high), key=abs))
-    half = 0.5 * (high - low)
-    decimals = exponent - _magnitude(half) + 1 if half > 0.0 else exponent - _magnitude(value) + 3
-    decimals = min(decimals, exponent - _magnitude(max(value, low, high, key=abs)) + 6)
-    texts = [_fixed(x, exponent, decimals) for x in (value, low, high)]
-    return texts[0] + _power(exponent), f"{texts[1]} to {texts[2]}{_power(exponent)}"
-
-
-def percent(share: float | None, sign: bool = False) -> str:
-    """A share (0..1) in percent; never rounded to 0 or 100 from outside, unless it is a change (`sign`)."""
-    if share is None or not math.isfinite(share):
-        return "–"
-    x = 100.0 * share
-    if not sign and 0.0 < x < 0.1:
-        return _with_unit("<\N{NO-BREAK SPACE}0.1", "%")
-    if not sign and 99.9 < x < 100.0:
-        return _with_unit(">\N{NO-BREAK SPACE}99.9", "%")
-    text = f"{x:.{int(x != 0.0 and (abs(x) < 10.0 or 99.0 < abs(x) < 100.0))}f}"
-    if sign and float(text) == 0.0:
-        text = "0"
-    elif sign and x > 0.0:
-        text = f"+{text}"
-    return _with_unit(text, "%").replace("-", "−")
-
-
-def probability(p: float) -> str:
-    """A probability in percent; never certain."""
-    return percent(min(max(p, 1e-6), 1.0 - 1e-6))
-
-
-def _magnitude(x: float) -> int:
-    return math.floor(math.log10(abs(x))) if x != 0.0 else 0
-
-
-def _exponent(x: float) -> int:
-    magnitude = _magnitude(x)
-    return magnitude if magnitude < -3 or magnitude > 4 else 0
-
-
-def _fixed(x: float, exponent: int, decimals: int) -> str:
-    return f"{round(x / 10.0**exponent, decimals) + 0.0:.{max(decimals, 0)}f}".replace("-", "−")
-
-
-def _power(exponent: int) -> str:
-    digits = str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-    return f"\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}10{digits}" if exponent else ""
-
-
-def _with_unit(text: str, unit: str) -> str:
-    return f"{text}\N{NO-BREAK SPACE}{unit}" if unit not in ("", "-") else text
-
-
-def _minus(formula: str) -> str:
-    """A formula with its hyphens as minus signs; those between letters stay."""
-    return re.sub(r"(?<![A-Za-z])-", "−", formula)
-
-
-def _ends(low: float, high: float) -> list[str]:
-    """The ends of a range to two digits of its width."""
-    decimals = 1 - _magnitude(high - low)
-    return [_fixed(x, 0, decimals) for x in (low, high)]
+        numbers=numbers, reach=reach, identified=_identified(doc), off=f"{100.0 * OFF:g}",
+        traces=_traces(diagnosis, doc), residuals=_residuals(diagnosis, doc),
+        misfit=_misfit(diagnosis, doc), unknown=_unknown(diagnosis, doc),
+        care=_care(diagnosis, doc, candidates, numbers))
 
 
 # --- what the page says
@@ -180,10 +114,10 @@ def _candidate(row: Any) -> dict[str, Any]:
     for name, q in row["parameters"].items():
         value, between = interval(q["value"], q["low"], q["high"])
         unit = PARAMETERS[f"model.{name}"].unit if number else CATALOGUE[effect].parameters[name].unit
-        parameters.append({"name": name, "value": _with_unit(value, unit), "between": between})
+        parameters.append({"name": name, "value": with_unit(value, unit), "between": between})
     return {
         "effect": effect, "number": number, "place": row["place"],
-        "physics": _minus(f"{PARAMETERS[f'model.{number}'].description}; its value is off" if number
+        "physics": minus(f"{PARAMETERS[f'model.{number}'].description}; its value is off" if number
                           else CATALOGUE[effect].physics),
         "probability": row["probability"], "parameters": parameters, "gap_after": row["gap_after"],
         "found": row["found"],
@@ -211,8 +145,9 @@ def _verdict(doc: Any, candidates: Sequence[dict[str, Any]]) -> dict[str, Any]:
     if share is None:
         judged = "has nothing to close: the gap is within the noise of the readings"
     else:
-        judged = (f"closes {percent(share) if share > 0.0 else 'none'} of the gap"
-                  f"{f' (95 % interval {between})' if between else ''} on {held}, to which nothing was fitted")
+        sure = f" ({percent(0.95)} interval {between})" if between else ""
+        judged = (f"closes {percent(share) if share > 0.0 else 'none'} of the gap{sure} on {held}, "
+                  "to which nothing was fitted")
     numbers = [(c["number"], PARAMETERS[f"model.{c['number']}"].description.partition(":")[0])
                for c in found if c["number"]]
     effects = [c["effect"] for c in found if not c["number"]]
@@ -238,16 +173,65 @@ def _verdict(doc: Any, candidates: Sequence[dict[str, Any]]) -> dict[str, Any]:
         else:
             sentence += [("", ".")]
         then = f"Adding {'it' if len(found) == 1 else 'them'}, with the numbers refitted, {judged}."
-    if share is not None and share < 0.5 and which["effects"] and which["verdict"] != "unknown":
+    if share is not None and share < 0.5 and RANDOM & set(which["effects"]) and which["verdict"] != "unknown":
         then += " What is random in it can be named and sized, but not predicted: that part of the gap stays open."
+    unknown = which.get("unknown")
     return {"sentence": sentence, "then": then, "lines": lines, "between": between,
+            "besides": unknown["place"] if unknown and which["verdict"] != "unknown" else "",
             "unexplained": which.get("unexplained", [])}
+
+
+def _care(diagnosis: Diagnosis, doc: Any, candidates: Sequence[dict[str, Any]], numbers: Sequence[dict[str, Any]]
+          ) -> list[str]:
+    """What speaks for taking this verdict with care, one sentence each."""
+    closed = doc["shrink"]["closed"]
+    found = [c for c in candidates if c["found"]]
+    care = []
+    missing = [VARIABLES[c][1] for c in CHANNELS if c not in doc["channels"]]
+    if missing:
+        care.append(f"Not measured: {', '.join(missing)}. What shows there alone can be neither seen nor told apart.")
+    notes = sum(not n.startswith("not measured") for s in diagnosis.signals for n in s.notes)
+    if notes:
+        care.append(f"{notes} {'note tells' if notes == 1 else 'notes tell'} what is odd in the data; see the end.")
+    fitted = sum(s.train * s.period for s in diagnosis.signals)
+    if fitted < SHORT:
+        care.append(f"Only {quantity(fitted, 's', 2)} were fitted: {quantity(SHORT, 's', 2)} or more say more.")
+    swings = all(not s.driven for s in diagnosis.signals)
+    for name, least in CALM.items():
+        if swings and name == "duty":
+            continue
+        spread = max(_range(s.channel(name)) for s in diagnosis.signals)
+        if spread < least:
+            _, plain, unit = VARIABLES[name]
+            care.append(f"The {plain} varied by {quantity(spread, unit, 2)} only: most effects hardly show in that.")
+    if found and closed is not None and closed < CLOSED and not RANDOM & {c["effect"] for c in found}:
+        care.append(f"No more than {percent(closed)} of the gap closes: there is more to it, or it has another form "
+                    "than the catalogue's.")
+    unsure = [c["number"] or c["effect"] for c in found if c["probability"] < 0.95]
+    if unsure:
+        care.append(f"Less sure than 95 %: {', '.join(unsure)}.")
+    for part in ELECTRICAL, MECHANICAL:
+        together = [c["number"] or c["effect"] for c in found if c["place"] in part]
+        if len(together) > 1:
+            care.append(f"In the same part of the chain: {', '.join(together)}. A share of one can pass as one of "
+                        "another.")
+    claimed = {c["number"] for c in found}
+    moved = [n["name"] for n in numbers if n["name"] not in claimed and (n["low"] > OFF or n["high"] < -OFF)]
+    if moved and "identified" not in doc:
+        care.append(f"Surely off by more than {100.0 * OFF:g} %, without being claimed: {', '.join(moved)}. "
+                    + ("Part of what is not known may hide there." if doc["which"].get("unknown") else
+                       "Check in the model file."))
+    return care
+
+
+def _range(x: Array) -> float:
+    return float(np.nanmax(x) - np.nanmin(x))
 
 
 def _line(candidate: dict[str, Any], doc: Any) -> dict[str, Any]:
     nominal = doc["which"]["numbers"].get(candidate["number"], {}).get("nominal", math.nan)
     unit = PARAMETERS[f"model.{candidate['number']}"].unit if candidate["number"] else ""
-    return {**candidate, "nominal": _with_unit(exact(nominal), unit) if candidate["number"] else ""}
+    return {**candidate, "nominal": with_unit(exact(nominal), unit) if candidate["number"] else ""}
 
 
 def _listed(names: Sequence[str]) -> list[tuple[str, str]]:
@@ -280,15 +264,31 @@ def _places(doc: Any, candidates: Sequence[dict[str, Any]]) -> list[dict[str, An
 
 def _region(r: Any) -> dict[str, Any]:
     symbol, plain, unit = VARIABLES[r["variable"]]
-    low, high = _ends(r["low"], r["high"])
-    return {"symbol": symbol, "plain": plain, "low": low, "high": _with_unit(high, unit), "share": r["share"],
+    low, high = ends(r["low"], r["high"])
+    return {"symbol": symbol, "plain": plain, "low": low, "high": with_unit(high, unit), "share": r["share"],
             "time": r.get("time")}
+
+
+def _identified(doc: Any) -> dict[str, Any] | None:
+    """Of a rig that nobody knew: what its numbers were identified from, which stay open, how they differ by run."""
+    identified = doc.get("identified")
+    if not identified:
+        return None
+    spread = [f"{name} by {quantity(n['run_to_run'], PARAMETERS[f'model.{name}'].unit.replace('-', ''), 2)}"
+              for name, n in doc["which"]["numbers"].items() if n.get("run_to_run")]
+    hangs, lift = identified.get("hangs_at"), identified.get("lift")
+    curve = (f"up to {quantity(lift['rad_per_s2'][-1], 'rad/s²')} at a duty of {lift['duty'][-1]:.2f}, none below "
+             f"{lift['dead_zone']:.2f}, behind a lag of {quantity(lift['lag_s'], 's', 2)}" if lift else "")
+    return {"basis": identified["from"], "open": identified["not_determined"], "spread": ", ".join(spread),
+            "hangs": quantity(hangs["value"], "rad", 2) if hangs else "", "lift": curve}
 
 
 def _numbers(doc: Any) -> tuple[list[dict[str, Any]], float]:
     """The rows of the table of numbers, and the shift at the edge of their pictures."""
     rows = []
     for name, n in doc["which"]["numbers"].items():
+        if not n.get("determined", True):
+            continue
         p = PARAMETERS[f"model.{name}"]
         value, between = interval(n["value"], n["low"], n["high"])
         scale = abs(n["nominal"]) or 1.0
@@ -362,7 +362,7 @@ def _figure(diagnosis: Diagnosis, k: int, doc: Any, figures: int) -> dict[str, A
     series: list[Array] = []
     drawn = [_strip(strip, part, max(COLUMNS // figures, 300), series) for strip in strips]
     most = ZOOM_VALUES // figures // len(series)
-    return {"strips": drawn, "start": start, "stop": stop, "ticks": _marks(start, stop, 8),
+    return {"strips": drawn, "start": start, "stop": stop, "ticks": marks(start, stop, 8),
             "data": {"start": start, "stop": stop, "series": [_packed(_least_and_greatest(x, most)) for x in series]}}
 
 
@@ -375,9 +375,9 @@ def _strip(strip: tuple[str, str, str, dict[str, Array]], part: slice, columns: 
     paths = [{"name": name, "index": len(series) + j, "d": _path(_least_and_greatest(x, 2 * columns), low, high)}
              for j, (name, x) in enumerate(cut.items())]
     series += cut.values()
-    marks = [{"at": 100.0 - m["at"], "text": m["text"]} for m in _marks(low, high, 5 if kind == "error" else 4)]
-    return {"what": what, "kind": kind, "said": said, "paths": paths, "ticks": marks,
-            "grid": "".join(f"M0 {HEIGHT * m['at'] / 100.0:.0f}h{WIDTH}" for m in marks)}
+    ticks = [{"at": 100.0 - m["at"], "text": m["text"]} for m in marks(low, high, 5 if kind == "error" else 4)]
+    return {"what": what, "kind": kind, "said": said, "paths": paths, "ticks": ticks,
+            "grid": "".join(f"M0 {HEIGHT * m['at'] / 100.0:.0f}h{WIDTH}" for m in ticks)}
 
 
 def _held_out(s: Signals) -> slice:
@@ -440,23 +440,12 @@ def _packed(x: Array) -> dict[str, object]:
     return {"low": low, "scale": scale, "data": base64.b64encode(steps.astype("<i2").tobytes()).decode("ascii")}
 
 
-def _marks(low: float, high: float, about: int) -> list[dict[str, Any]]:
-    """Round values within low..high: where (percent of the way) and as text."""
-    raw = (high - low) / about
-    base = 10.0 ** math.floor(math.log10(raw))
-    step = next(m * base for m in (1.0, 2.0, 5.0, 10.0) if m * base >= raw * 0.999)
-    decimals = max(0, -math.floor(math.log10(step) + 1e-9))
-    return [{"at": 100.0 * (k * step - low) / (high - low), "text": _fixed(k * step, 0, decimals)}
-            for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
-
-
 def _residuals(diagnosis: Diagnosis, doc: Any) -> list[dict[str, Any]]:
     """For each channel its error on held-out data against each variable, in bins."""
     parts = [_held_out(s) for s in diagnosis.signals]
     against = {name: np.concatenate([_variable(s, name)[p] for s, p in zip(diagnosis.signals, parts, strict=True)])
-               for name in ("theta", "theta_dot", "omega", "i_a", "duty", "t")}
-    against = {name: x for name, x in against.items()
-               if np.isfinite(x).sum() > 10 * BINS and np.nanmax(x) > np.nanmin(x)}
+               for name in AGAINST}
+    against = {name: x for name, x in against.items() if _varies(x)}
     rows = []
     for channel, c in doc["channels"].items():
         errors = [np.concatenate([r[channel][p] - s.channel(channel)[p]
@@ -470,6 +459,50 @@ def _residuals(diagnosis: Diagnosis, doc: Any) -> list[dict[str, Any]]:
         rows.append({"symbol": symbol, "plain": plain, "unit": unit, "reach": quantity(reach, unit, 2), "cells": cells,
                      "noise": [HEIGHT * (0.5 - c["floor"] / reach), HEIGHT * 2.0 * c["floor"] / reach]})
     return rows
+
+
+def _misfit(diagnosis: Diagnosis, doc: Any) -> list[dict[str, Any]]:
+    """What the nominal model leaves unexplained in the cut chain against each variable, with the regions named."""
+    misfit, regions = diagnosis.misfit["misfit"], doc["where"]["regions"]
+    against = {name: diagnosis.misfit[name] for name in AGAINST if _varies(diagnosis.misfit[name])}
+    binned = {name: _binned(x, misfit, misfit) for name, x in against.items()}
+    most = [float(np.nanmax(np.abs(lines[1:]))) for _, lines in binned.values() if np.isfinite(lines).any()]
+    if not most or (doc["which"]["verdict"] == "none" and not regions):
+        return []
+    cells = []
+    for name, (edges, lines) in binned.items():
+        cell = _cell(name, edges, lines, 1.1 * max(most), "", "")
+        width = float(edges[-1] - edges[0])
+        marked = [np.clip([(r[key] - edges[0]) / width for key in ("low", "high")], 0.0, 1.0)
+                  for r in regions if r["variable"] == name]
+        named = "".join(f"; the range from {' to '.join(ends(r['low'], r['high']))} stands out"
+                        for r in regions if r["variable"] == name)
+        cells.append({**cell, "said": f"Misfit of the nominal model against {VARIABLES[name][1]}{named}",
+                      "regions": [[WIDTH * a, WIDTH * (b - a)] for a, b in marked]})
+    return cells
+
+
+def _unknown(diagnosis: Diagnosis, doc: Any) -> dict[str, Any] | None:
+    """The curves of something outside the catalogue, where there is such."""
+    unknown = doc["which"].get("unknown")
+    if not unknown:
+        return None
+    n = diagnosis.augmented.model
+    speed, current = (np.concatenate([np.asarray(r[c]) for r in diagnosis.after]) for c in ("omega", "i_a"))
+    rate = np.concatenate([_variable(s, "theta_dot") for s in diagnosis.signals])
+    step = np.concatenate([np.diff(s.duty) for s in diagnosis.signals])
+    factors = curves.Factors(n["L_over_J"] * n["k_thrust"] * _rms(speed**2), _rms(rate), _rms(current),
+                             _rms(step[np.abs(step) > 1e-3]))
+    return curves.drawn(unknown, factors, max(s.train * s.period for s in diagnosis.signals))
+
+
+def _rms(x: Array) -> float:
+    x = x[np.isfinite(x)]
+    return float(np.sqrt(np.mean(x**2))) if len(x) else 0.0
+
+
+def _varies(x: Array) -> bool:
+    return bool(np.isfinite(x).sum() > 10 * BINS and np.nanmax(x) > np.nanmin(x))
 
 
 def _variable(s: Signals, name: str) -> Array:
@@ -507,7 +540,7 @@ def _cell(name: str, edges: Array, lines: Array, reach: float, plain: str, unit:
     y = HEIGHT * (0.5 - 0.5 * lines / reach)
     band = "".join("M" + "L".join(_points(y[3], a, b) + _points(y[1], a, b)[::-1]) + "z" for a, b in _runs(known))
     worst = [float(np.nanmax(np.abs(lines[j]))) if known.any() else math.nan for j in (0, 2)]
-    return {"symbol": symbol, "unit": against_unit, "ends": _ends(float(edges[0]), float(edges[-1])), "band": band,
+    return {"symbol": symbol, "unit": against_unit, "ends": ends(float(edges[0]), float(edges[-1])), "band": band,
             "before": _joined(y[0]), "after": _joined(y[2]),
             "said": f"Error of the {plain} against {against}: its median reaches {quantity(worst[0], unit)} with the "
                     f"nominal model and {quantity(worst[1], unit)} with the augmented model"}

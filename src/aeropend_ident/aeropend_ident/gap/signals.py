@@ -10,8 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from aeropend_ident.gap.saturation import jumps_out, saturated
 from aeropend_ident.recording import Recording, RecordingError
 from aeropend_sim.effects import CATALOGUE
+from aeropend_sim.parameters import SAMPLE_PERIOD
 from aeropend_sim.sensing import SPEED_TIMEOUT
 
 Array = NDArray[np.float64]
@@ -25,6 +27,9 @@ MINIMUM_DURATION = 5.0
 
 STILL = 0.01
 """Duty that changes by less is no excitation."""
+
+SETTLED = 0.012
+"""s after a step of the duty in which the current says when the step came, and little else."""
 
 PEAK = 1.25
 """A rotor is too heavy for one interval to be this much faster than both of its neighbours."""
@@ -86,6 +91,11 @@ class Signals:
         """First sample whose voltage no duty from before the recording can have set, however late it acts."""
         return math.ceil(CATALOGUE["command_delay"].parameters["delay"].high / self.period) + 1
 
+    @property
+    def driven(self) -> bool:
+        """Whether a duty ever acts."""
+        return bool(np.max(self.duty) >= STILL)
+
     def channel(self, name: str) -> Array:
         """A measured channel by name, (N,)."""
         return np.asarray(getattr(self, name))
@@ -143,6 +153,15 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
         if len(x) and np.ptp(x) == 0.0 and np.ptp(duty) > STILL:
             columns[channel] = np.full(n, np.nan)
             said.append(f"{channel} is {x[0]:g} {CHANNELS[channel]} all the time, whatever the duty: it is left out")
+    said += _left_out(columns)
+    if np.ptp(columns["theta"][np.isfinite(columns["theta"])]) == 0.0:
+        raise RecordingError(f"{name}: the arm angle stays the same all the time: the sensor or the arm is stuck, "
+                             "so no verdict is possible")
+    if period > 1.25 * SAMPLE_PERIOD:  # the duty may have stepped between two samples
+        steps = np.flatnonzero(np.abs(np.diff(duty)) > STILL) + 1
+        near = steps[:, None] + np.arange(math.ceil(SETTLED / period) + 1)
+        columns["i_a"] = columns["i_a"].copy()
+        columns["i_a"][np.minimum(near, n - 1)] = np.nan
     lsb = {"theta": "angle", "i_a": "current", "v_a": "voltage"}
     sigma = {"omega": max(sensing["speed_noise"], _noise_of(columns["omega"]))}
     for channel, key in lsb.items():
@@ -159,6 +178,25 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
     false_speed = _held_false(pulses, n) if pulses else _outliers(columns["omega"], sigma["omega"])
     return Signals(period, duty, columns["theta"], columns["omega"], columns["i_a"], columns["v_a"], sigma, pulses,
                    false_speed, train, tuple(said))
+
+
+def _left_out(columns: dict[str, Array]) -> list[str]:
+    """Take readings at the end of their range, and single ones that jump out, from the columns; says which."""
+    said = []
+    for channel, unit in CHANNELS.items():
+        x = columns[channel]
+        if channel != "omega":  # a speed is held between its pulses
+            limit = saturated(x, smooth=channel == "theta")
+            if limit.any():
+                ends = " and ".join(f"{e:g}" for e in np.unique(x[limit]))
+                said.append(f"{channel} sits at {ends} {unit}, the end of its range, for {100.0 * limit.mean():.1f} % "
+                            "of the time: it is left out there")
+            x = np.where(limit, np.nan, x)
+        alone = jumps_out(x, _noise_of(x))
+        if alone.any():
+            said.append(f"{channel}: {alone.sum()} single readings jump out and are left out")
+        columns[channel] = np.where(alone, np.nan, x)
+    return said
 
 
 def _held(x: Array) -> Array:
@@ -178,8 +216,9 @@ def _noise_of(x: Array) -> float:
     return max(white, resolution / math.sqrt(12.0), 1e-6 * float(np.ptp(x)), 1e-9)
 
 
-def _pulse_times(at: NDArray[np.int64], unseen: NDArray[np.int64], passed: Array, period: float) -> Array:
-    """Instants (M,) of pulses.
+def _pulse_times(at: NDArray[np.int64], unseen: NDArray[np.int64], passed: Array, period: float
+                 ) -> tuple[Array, Array]:
+    """Instants (M,) of pulses, and by how much each may be off either way (M,).
 
     Args:
         at: (M,) samples in which they show first. unseen: (M,) samples missing before those.
@@ -189,7 +228,7 @@ def _pulse_times(at: NDArray[np.int64], unseen: NDArray[np.int64], passed: Array
     all of them at once, and leaves little room for any.
     """
     earliest, latest = (at - 1.0 - unseen) * period, at * period
-    time = 0.5 * (earliest + latest)
+    time, room = 0.5 * (earliest + latest), 0.5 * (latest - earliest)
     start = 0
     while start < len(at):
         low, high, since, stop = earliest[start], latest[start], 0.0, start + 1
@@ -203,8 +242,9 @@ def _pulse_times(at: NDArray[np.int64], unseen: NDArray[np.int64], passed: Array
             offsets.append(since)
             stop += 1
         time[start:stop] = 0.5 * (low + high) + np.array(offsets)
+        room[start:stop] = 0.5 * (high - low)
         start = stop
-    return np.asarray(time, dtype=float)
+    return np.asarray(time, dtype=float), np.asarray(room, dtype=float)
 
 
 def _held_false(pulses: Pulses, n: int) -> NDArray[np.bool_]:
@@ -238,24 +278,32 @@ def find_pulses(omega: Array, period: float, sensing: Mapping[str, float]) -> Pu
     length = turn / speed if len(at) else np.zeros(0)
     elapsed = np.diff(at, prepend=-(10**9)) * period
     stopped = np.zeros(len(at), dtype=bool)  # the speed read 0 before this interval showed
+    stopped[:1] = held[:1] == 0.0
     stopped[1:] = np.minimum.reduceat(held, at)[:-1] == 0.0 if len(at) else []
     known = np.flatnonzero(np.isfinite(omega))
     unseen = at - 1 - known[np.maximum(np.searchsorted(known, at) - 1, 0)]  # samples missing before each, (M,)
-    false = np.zeros(len(at), dtype=bool)
+    anew = np.zeros(len(at), dtype=bool)  # after a stop: nothing says how long the interval was
     passed = length.copy()  # time since the pulse of the interval before
+    starts_anew = stopped & (length < SPEED_TIMEOUT)
+    after = np.append(speed, [np.inf, np.inf])
+    before = np.where(starts_anew & (after[2:] > after[1:-1]), 0.0, np.append(held[:1], speed)[: len(at)])
+    alone = speed > PEAK * np.maximum(before, after[1:-1])
+    false = alone.copy()
     for j in range(1, len(at)):
         if not false[j - 1]:
             # a period repeated to the tick does not show: whole multiples of the one before may have passed unseen
             passed[j] += max(round((elapsed[j] - length[j]) / length[j - 1]), 0) * length[j - 1]
-        starts_anew = stopped[j] and length[j] < SPEED_TIMEOUT
-        alone = j + 1 < len(at) and speed[j] > PEAK * max(speed[j - 1], speed[j + 1])
         late = (1.01 + unseen[j] + unseen[j - 1]) * period + 2.0 * sensing["speed_tick"]
         fits = abs(elapsed[j] - passed[j]) <= late
-        false[j] = alone or not (fits or starts_anew)
+        false[j] = alone[j] or not (fits or starts_anew[j])
+        anew[j] = not fits and not false[j]
         if false[j] or stopped[j]:
             passed[j] = np.inf
-    time = _pulse_times(at, unseen, passed, period)
+    time, room = _pulse_times(at, unseen, passed, period)
+    room = np.hypot(room, max(period - SAMPLE_PERIOD, 0.0))  # the duty may have stepped between two samples
     slope = np.gradient(speed, time) if len(at) > 2 else np.zeros(len(at))
     tick = np.maximum(sensing["speed_tick"], 1e-6) * speed / np.maximum(length, 1e-9) if len(at) else np.zeros(0)
-    sigma: Array = np.sqrt(tick**2 + sensing["speed_noise"] ** 2 + (0.4 * period * slope) ** 2 + (2e-4 * speed) ** 2)
-    return Pulses(at, time, length, speed, sigma, false)
+    sigma: Array = np.sqrt(tick**2 + sensing["speed_noise"] ** 2 + (room * slope) ** 2 + (2e-4 * speed) ** 2)
+    sigma = np.where(anew, 0.5 * speed, sigma)
+    whole = time >= length  # an interval that began before the recording cannot be simulated
+    return Pulses(at[whole], time[whole], length[whole], speed[whole], sigma[whole], false[whole])

@@ -6,20 +6,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from aeropend_ident.gap.chain import BLOCKS, PLACE_OF_NUMBER, Chains
 from aeropend_ident.gap.fit import Fit, Unknown, fit, screen
+from aeropend_ident.gap.shape import shapes
+from aeropend_ident.gap.unknowns import NUMBER_SD, free_swinging, initial_unknowns, nominal_unknowns
 from aeropend_sim.effects import CATALOGUE, PARAMETER_MISMATCH
 from aeropend_sim.parameters import PARAMETERS, Model
-
-NUMBER_SD = 0.05
-"""Relative standard deviation of a nominal number, unless it is known better."""
-
-GUESS_SD = 0.55
-"""Standard deviation of the logarithm of a number that is only a guess: a factor of three either way is two of it."""
 
 MISMATCH_SD = 0.3
 """As `NUMBER_SD`, for the number that `parameter_mismatch` blames."""
@@ -32,6 +28,24 @@ MATERIAL = 0.3
 
 SHORTLIST = 8
 """How many hypotheses are fitted in full after the screening."""
+
+STRAYED = 3.0
+"""Standard deviations by which a number must leave its prior to count as strayed."""
+
+FIRST_LOOK, ROUNDS = 2, 10
+"""Rounds of a fit for all of the shortlist, and for the likeliest of them."""
+
+STEPS, STEPS_UNKNOWN = 4, 12
+"""Steps in each round; numbers that nobody knows lie in long valleys."""
+
+CONTENDERS = 4
+"""How many of the likeliest are fitted to the end, and compared closely when none of them explains all."""
+
+CLOSE = 1.5
+"""Rivals are close when their mean square residuals are within this factor."""
+
+FORM_SHOWS = 1.2
+"""Mean square residual, in units of a reading's noise, from which on an effect must have another form."""
 
 MOST_EFFECTS = 3
 """How many effects are looked for in one part of the chain."""
@@ -93,32 +107,6 @@ class Findings:
         return [round_[0].hypothesis for round_ in self.found]
 
 
-def number_unknowns(chains: Chains, block: str) -> list[Unknown]:
-    """The numbers of a block with their priors; a number that is nominally 0 stays 0."""
-    unknowns = []
-    for name in BLOCKS[block]:
-        nominal, p = chains.model.model[name], PARAMETERS[f"model.{name}"]
-        if nominal > 0.0 and chains.fit_nominal:
-            unknowns.append(Unknown(name, nominal, GUESS_SD, max(p.low, 1e-12), p.high, log=True))
-        elif nominal != 0.0:
-            sd = (GUESS_SD if chains.fit_nominal else NUMBER_SD) * abs(nominal)
-            unknowns.append(Unknown(name, nominal, sd, p.low, p.high))
-    return unknowns
-
-
-def initial_unknowns(chains: Chains, block: str) -> list[Unknown]:
-    """The state at the first sample of each recording, as far as a block needs it."""
-    unknowns = []
-    for suffix, s in chains.named():
-        if block == "motor" and s.has("omega"):
-            first = float(s.omega[np.isfinite(s.omega)][0])
-            unknowns.append(Unknown(f"initial.omega{suffix}", first, 10.0, 0.0, 2000.0))
-        if block == "arm":
-            start = float(np.mean(s.theta[np.isfinite(s.theta)][:10]))
-            unknowns += [Unknown(f"initial.theta{suffix}", start, 0.1), Unknown(f"initial.theta_dot{suffix}", 0.0, 1.0)]
-    return unknowns
-
-
 def hypotheses(model: Model, *, numbers: bool = True) -> list[Hypothesis]:
     """Every effect of the catalogue that the model lacks, and every of its `numbers` as a mismatch."""
     all_ = [Hypothesis(id_, starts=tuple(_starts(id_))) for id_ in CATALOGUE if id_ not in model.effects]
@@ -168,8 +156,11 @@ def blocks_of(chains: Chains, hypothesis: Hypothesis) -> tuple[str, ...]:
         values = {f"{hypothesis.effect}.{k}": p.default for k, p in CATALOGUE[hypothesis.effect].parameters.items()}
     changed = []
     for block in BLOCKS:
-        before, after = chains.residuals(block)({}), chains.residuals(block)(values)
-        if any(len(r) and not np.array_equal(r, after[k]) for k, r in before.items()):
+        # an arm that nothing drives must at least be let go
+        state = {u.name: u.mean for u in initial_unknowns(chains, block)} if chains.fit_nominal else {}
+        before, after = chains.residuals(block)(state), chains.residuals(block)({**state, **values})
+        if any(len(r) and not np.array_equal(r, after[k]) and not (
+                chains.fit_nominal and np.allclose(r, after[k], rtol=0.0, atol=1e-6)) for k, r in before.items()):
             changed.append(block)
     return tuple(changed)
 
@@ -207,43 +198,102 @@ def search(chains: Chains, jobs: int = 1, progress: Callable[[str, float], None]
 
 def _search_block(chains: Chains, block: str, candidates: list[Hypothesis], where: Mapping[str, tuple[str, ...]],
                   carried: list[Unknown], pool: ThreadPoolExecutor) -> Findings:
-    known: list[Unknown] = [*initial_unknowns(chains, block), *number_unknowns(chains, block), *carried]
+    known: list[Unknown] = [*nominal_unknowns(chains, block), *carried]
     base = fit(chains.residuals(block), known)
     findings = Findings(block, base, base)
     if not base.residuals:
         return findings
+    candidates = [_started_late(chains, h, base.values) if h.effect == "command_delay" else h for h in candidates]
     downstream = {}
     for other in {b for h in candidates for b in where[h.name] if b != block}:
-        downstream[other] = fit(chains.residuals(other), [*initial_unknowns(chains, other),
-                                                         *number_unknowns(chains, other)])
+        downstream[other] = fit(chains.residuals(other), nominal_unknowns(chains, other))
     nominal = known
+    # what brakes a free swing is told by the evidence alone: its noise is known but roughly, and its readings are few
+    swinging = chains.fit_nominal and free_swinging(chains.recordings)
     while len(findings.found) < MOST_EFFECTS:
         current = findings.final
+        if _passes_as_noise(current) and not strayed(chains, block, current) and not swinging:
+            break
         open_ = [h for h in candidates if h.name not in {g.name for g in findings.effects}]
         chosen = _shortlist(chains, block, open_, known, current)
-        work = [pool.submit(_try, chains, block, h, start, known, current, downstream, where[h.name])
+        work = [pool.submit(_try, chains, block, h, start, known, current, downstream, where[h.name], FIRST_LOOK)
                 for h, start in chosen]
         tried = [(h, w.result()) for (h, _), w in zip(chosen, work, strict=True)]
+        # the likeliest are fitted to the end
+        likeliest = [w.hypothesis for w in _weigh(block, tried, current, downstream, where)[:CONTENDERS]]
+        further = [pool.submit(_try, chains, block, h, 0, known, current, downstream, where[h.name], ROUNDS, f)
+                   if h in likeliest else None for h, f in tried]
+        tried = [(h, w.result() if w else f) for (h, f), w in zip(tried, further, strict=True)]
         rivals = _weigh(block, tried, current, downstream, where)
         if not rivals:
             break
+        if chains.fit_nominal and not swinging and rivals[0].gain > 0.0:
+            # numbers that nobody knows may have led the others astray
+            lead = rivals[0]
+            others = [(h, f) for h, f in tried if h is not lead.hypothesis]
+            led = [pool.submit(_try, chains, block, h, 0, known, current, downstream, where[h.name], 2 * FIRST_LOOK,
+                               lead.fit) for h, _ in others]
+            counts = counts_of([lead.fit, *(f for _, f in others)])
+            anew = {h.name: one.result() for (h, _), one in zip(others, led, strict=True)}
+            tried = [(h, anew[h.name] if h.name in anew and anew[h.name].evidence(counts) > f.evidence(counts)
+                      else f) for h, f in tried]
+            rivals = _weigh(block, tried, current, downstream, where)
+        rivals = _told_apart_by_place(chains, block, rivals, known)
         # the numbers that a rival was led to may serve as well without it
         again = fit(chains.residuals(block), _started(known, rivals[0].fit.values))
-        counts = _counts([current, again])
+        counts = counts_of([current, again])
         if again.evidence(counts) > current.evidence(counts) + 1.0:
             current = findings.final = again
             findings.base = findings.base if findings.found else again
-            rivals = _weigh(block, tried, current, downstream, where)
+            rivals = _told_apart_by_place(chains, block, _weigh(block, tried, current, downstream, where), known)
         best = rivals[0]
-        if best.probability < 0.5 or not (best.hypothesis.number or _material(current, best.fit)):
+        matters = best.hypothesis.number or _material(current, best.fit) or strayed(chains, block, current)
+        if sum(w.probability for w in rivals) < 0.5 or not matters:
             findings.rivals = rivals
             break
         findings.found.append(rivals)
         known = _adopt(known, best.hypothesis)
         findings.final = best.fit if set(best.fit.residuals) == set(base.residuals) else fit(
             chains.residuals(block), _started(known, best.fit.values))
+    _swap(chains, findings, nominal)
     _prune(chains, findings, nominal)
     return findings
+
+
+def _swap(chains: Chains, findings: Findings, nominal: list[Unknown]) -> None:
+    """Replace what was found first, and only stood in for what was not yet known of the others, by a close rival."""
+    if len(findings.found) < 2:
+        return
+    for k, round_ in enumerate(findings.found):
+        known = nominal
+        for h in findings.effects:
+            if h is not round_[0].hypothesis:
+                known = _adopt(known, h)
+        taken = {h.name for h in findings.effects}
+        for rival in round_[1:CONTENDERS]:
+            if rival.gain <= 0.0 or rival.hypothesis.name in taken:
+                continue
+            begun = {**findings.final.values, **{u.name: rival.fit.values[u.name] for u in rival.hypothesis.starts[0]}}
+            f = fit(chains.residuals(findings.block), _started(_adopt(known, rival.hypothesis), begun))
+            counts = counts_of([findings.final, f])
+            odds = _log_odds(rival.hypothesis) - _log_odds(findings.found[k][0].hypothesis)
+            gain = f.evidence(counts) - findings.final.evidence(counts) + odds
+            if gain > 0.0:
+                sure = 1.0 / (1.0 + math.exp(-min(gain, 500.0)))
+                others = [replace(w, probability=1.0 - sure if w is round_[0] else 0.0) for w in round_
+                          if w is not rival]
+                findings.found[k] = [replace(rival, fit=f, gain=rival.gain + gain, probability=sure), *others]
+                findings.final = f
+                break
+
+
+def _started_late(chains: Chains, hypothesis: Hypothesis, values: Mapping[str, float]) -> Hypothesis:
+    """The delay where the voltage places it: a reading changes with the delay in jumps, which no slope leads over."""
+    own = hypothesis.starts[0][0]
+    if not chains.each[0].signals.has("v_a"):
+        return hypothesis
+    start = chains.each[0].likeliest_delay(chains.own(values, 0))
+    return replace(hypothesis, starts=((replace(own, mean=start, start=start),),))
 
 
 def _prune(chains: Chains, findings: Findings, nominal: list[Unknown]) -> None:
@@ -256,7 +306,7 @@ def _prune(chains: Chains, findings: Findings, nominal: list[Unknown]) -> None:
                 if h is not round_[0].hypothesis:
                     known = _adopt(known, h)
             f = fit(chains.residuals(findings.block), _started(known, findings.final.values))
-            counts = _counts([findings.final, f])
+            counts = counts_of([findings.final, f])
             gain = findings.final.evidence(counts) - f.evidence(counts) + _log_odds(round_[0].hypothesis)
             without.append((gain, round_, f))
         gain, round_, f = min(without, key=lambda w: w[0])
@@ -293,20 +343,61 @@ def _adopt(known: list[Unknown], hypothesis: Hypothesis, start: int = 0) -> list
 
 
 def _try(chains: Chains, block: str, hypothesis: Hypothesis, start: int, known: list[Unknown], current: Fit,
-         downstream: Mapping[str, Fit], blocks: tuple[str, ...]) -> Fit:
-    """Fit a hypothesis on top of what is known, on every part of the chain that it changes."""
+         downstream: Mapping[str, Fit], blocks: tuple[str, ...], rounds: int, begun: Fit | None = None) -> Fit:
+    """Fit a hypothesis on top of what is known, on every part of the chain that it changes; goes on from `begun`."""
     parts = [chains.residuals(block)]
     unknowns = _started(known, current.values)
     for other in blocks:
         if other != block:
             parts.append(chains.residuals(other))
-            extra = [*initial_unknowns(chains, other), *number_unknowns(chains, other)]
+            extra = nominal_unknowns(chains, other)
             unknowns += _started(extra, downstream[other].values)
 
     def residuals(values: dict[str, float]) -> dict[str, np.ndarray]:
         return {k: r for part in parts for k, r in part(values).items()}
 
-    return fit(residuals, _adopt(unknowns, hypothesis, start))
+    swinging = chains.fit_nominal and free_swinging(chains.recordings)
+    steps = STEPS_UNKNOWN if chains.fit_nominal and not swinging else STEPS
+    if begun is not None:
+        return fit(residuals, _started(_adopt(unknowns, hypothesis), begun.values), rounds, steps)
+    if not hypothesis.number and CATALOGUE[hypothesis.effect].linear_in:
+        first = fit(lambda values: residuals(from_linear(hypothesis.effect, values)),
+                    [*unknowns, *linear_unknowns(hypothesis.effect)], rounds=3)
+        own = from_linear(hypothesis.effect, first.values)
+        size, second = (f"{hypothesis.effect}.{name}" for name in list(CATALOGUE[hypothesis.effect].parameters)[:2])
+        bounds = CATALOGUE[hypothesis.effect].parameters[second.partition(".")[2]]
+        # of an unknown rig the product alone may be sure: a search that begins at a bound would stay there
+        inside = chains.fit_nominal and CATALOGUE[hypothesis.effect].linear_in == "product"
+        reach = 0.3 if inside else 1.0
+        own[size] *= max(1.0, own[second] / (reach * bounds.high), own[second] / (reach * bounds.low))
+        if inside:
+            own[second] = min(max(own[second], reach * bounds.low), reach * bounds.high)
+        return fit(residuals, _started(_adopt(unknowns, hypothesis), own), rounds, steps)
+    return fit(residuals, _adopt(unknowns, hypothesis, start), rounds, steps)
+
+
+def linear_unknowns(id_: str) -> list[Unknown]:
+    """Two unknowns in which an effect is linear, in place of its size and second parameter; both 0 without it."""
+    size, second = list(CATALOGUE[id_].parameters.values())[:2]
+    if CATALOGUE[id_].linear_in == "polar":
+        return [Unknown(f"{id_}.cosine", 0.0, 3.0 * size.default), Unknown(f"{id_}.sine", 0.0, 3.0 * size.default)]
+    return [Unknown(f"{id_}.slope", 0.0, 3.0 * size.default, size.low, size.high),
+            Unknown(f"{id_}.product", 0.0, 3.0 * size.default * second.default)]
+
+
+def from_linear(id_: str, values: Mapping[str, float]) -> dict[str, float]:
+    """Values with the unknowns of `linear_unknowns` turned into the effect's own parameters."""
+    (size_name, size), (second_name, _) = list(CATALOGUE[id_].parameters.items())[:2]
+    own = dict(values)
+    if CATALOGUE[id_].linear_in == "polar":
+        x, y = own.pop(f"{id_}.cosine"), own.pop(f"{id_}.sine")
+        pair = math.hypot(x, y), math.atan2(y, x)
+    else:
+        x, y = own.pop(f"{id_}.slope"), own.pop(f"{id_}.product")
+        x = max(x, 1e-6 * size.default)  # so that the product alone can act
+        pair = x, y / x
+    own[f"{id_}.{size_name}"], own[f"{id_}.{second_name}"] = pair
+    return own
 
 
 def _weigh(block: str, tried: list[tuple[Hypothesis, Fit]], current: Fit, downstream: Mapping[str, Fit],
@@ -314,7 +405,7 @@ def _weigh(block: str, tried: list[tuple[Hypothesis, Fit]], current: Fit, downst
     """Log evidence of each against none further, and probabilities; best first."""
     if not tried:
         return []
-    counts = _counts([current, *downstream.values(), *(f for _, f in tried)])
+    counts = counts_of([current, *downstream.values(), *(f for _, f in tried)])
     gains = [f.evidence(counts) - current.evidence(counts) + _log_odds(h)
              - sum(downstream[b].evidence(counts) for b in where[h.name] if b != block) for h, f in tried]
     weights = np.array([*gains, 0.0])
@@ -324,7 +415,38 @@ def _weigh(block: str, tried: list[tuple[Hypothesis, Fit]], current: Fit, downst
     return sorted(weighed, key=lambda w: -w.gain)
 
 
-def _counts(fits: Iterable[Fit]) -> dict[str, float]:
+def _told_apart_by_place(chains: Chains, block: str, rivals: list[Weighed], known: list[Unknown]) -> list[Weighed]:
+    """Decide between rivals of which none explains all: an effect of another form than the catalogue's is among them.
+
+    Each is given free curves at its own place. The right one needs them for its form alone; a wrong one, which only
+    borrows the gap of a neighbour, cannot mend it from where it lives.
+    """
+    best = _mean_square(rivals[0].fit, block)
+    close = [w for w in rivals[:CONTENDERS] if w.gain > 0.0 and _mean_square(w.fit, block) < CLOSE * best]
+    if best < FORM_SHOWS or len({w.hypothesis.place for w in close}) < 2:
+        return rivals
+    left: list[tuple[float, float]] = []
+    for w in close:
+        own = [s for s in shapes(chains, block, w.fit, _adopt(known, w.hypothesis)) if s.place == w.hypothesis.place]
+        left += [(s.left, s.independent) for s in own] or [(_mean_square(w.fit, block), 1.0)]
+    count = max(n for _, n in left)
+    evidence = np.array([-0.5 * count * math.log(max(x, 1.0)) for x, _ in left])
+    weights = np.exp(evidence - evidence.max())
+    weights *= sum(w.probability for w in close) / weights.sum()
+    again = [replace(w, probability=float(p)) for w, p in zip(close, weights, strict=True)]
+    order = {id(w): -float(e) for w, e in zip(again, evidence, strict=True)}
+    rest = [w for w in rivals if all(w is not c for c in close)]
+    return [*sorted(again, key=lambda w: order[id(w)]), *rest]
+
+
+def _mean_square(f: Fit, block: str) -> float:
+    """Mean square residual of a fit in the channels of a block, in units of a reading's noise."""
+    home = {"actuator": ("v_a",), "motor": ("i_a", "omega"), "arm": ("theta",)}[block]
+    own = [r for k, r in f.residuals.items() if k.partition("@")[0] in home]
+    return float(np.mean(np.concatenate(own) ** 2)) if own else 0.0
+
+
+def counts_of(fits: Iterable[Fit]) -> dict[str, float]:
     """Independent samples of each channel, one count for all fits that are compared: the whitest residual's."""
     counts: dict[str, float] = {}
     for f in fits:
@@ -336,6 +458,30 @@ def _counts(fits: Iterable[Fit]) -> dict[str, float]:
 def _log_odds(hypothesis: Hypothesis) -> float:
     """Prior log odds of a hypothesis against none further."""
     return math.log(EFFECT_ODDS / (sum(map(len, BLOCKS.values())) if hypothesis.number else 1))
+
+
+def strayed(chains: Chains, block: str, f: Fit) -> bool:
+    """Whether a number of the block had to go where its prior does not let it, to cover for something."""
+    nominal = chains.model.model
+    return not chains.fit_nominal and any(
+        abs(f.values[n] - nominal[n]) > STRAYED * NUMBER_SD * abs(nominal[n]) for n in BLOCKS[block] if n in f.values)
+
+
+def not_strayed(chains: Chains, block: str, f: Fit, known: Iterable[Unknown]) -> Fit:
+    """A fit of the nominal structure, or, where numbers strayed, one that keeps them within their uncertainty."""
+    if not strayed(chains, block, f):
+        return f
+    reach = {u.name: STRAYED * NUMBER_SD * abs(u.mean) for u in known if u.name in BLOCKS[block]}
+    held = [replace(u, low=max(u.low, u.mean - reach[u.name]), high=min(u.high, u.mean + reach[u.name]))
+            if u.name in reach else u for u in known]
+    carried = {n: v for n, v in f.values.items() if n not in {u.name for u in held}}
+    residuals = chains.residuals(block)
+    return fit(lambda values: residuals({**carried, **values}), held)
+
+
+def _passes_as_noise(f: Fit) -> bool:
+    """Whether so little is left that nothing could explain a material part of it."""
+    return all(float(np.mean(r * r)) < 1.0 + 0.5 * MATERIAL**2 for r in f.residuals.values())
 
 
 def _material(before: Fit, after: Fit) -> bool:

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The folder with a command's results: there whole, or not at all."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from aeropend_sim.parameters import ModelError
+from aeropend_sim.untrusted import one_line
+
+
+class OutputError(ValueError):
+    """The results cannot be written; the message is one line for a person."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(one_line(text))
+
+
+def check(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
+    """Make sure before the work that its results have a place.
+
+    Raises:
+        OutputError: `out` is no folder, or holds results already.
+    """
+    if out.exists() and not out.is_dir():
+        raise OutputError(f"{out}: is a file; --out takes a folder")
+    taken = [name for name in files if (out / name).exists()]
+    if taken and not overwrite:
+        raise OutputError(f"{out}: holds {taken[0]} already; give another --out, or --overwrite to replace it")
+
+
+@contextmanager
+def whole(out: Path, files: Sequence[str]) -> Iterator[Path]:
+    """A folder to write `files` to; they appear in `out` together, when the block ends without an exception.
+
+    Raises:
+        OutputError: the folder cannot be made or written.
+    """
+    made = not out.exists()
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=out, prefix=".writing_") as place:
+            yield Path(place)
+            for name in files:
+                (Path(place) / name).replace(out / name)
+    except BaseException as error:  # Ctrl-C too
+        if made:
+            shutil.rmtree(out, ignore_errors=True)
+        if not isinstance(error, (OSError, ModelError)):
+            raise
+        why = error.strerror if isinstance(error, OSError) else error
+        raise OutputError(f"{out}: the results cannot be written: {why}; give another folder with --out or make room"
+                          ) from None

@@ -1,0 +1,379 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the columns of a table to the samples of a rig, as a person says what the columns are."""
+
+from __future__ import annotations
+
+import math
+import re
+import unicodedata
+from dataclasses import dataclass
+
+import numpy as np
+
+from aeropend_ident.tables import clock
+from aeropend_ident.tables.clock import ClockError, Dated
+from aeropend_ident.tables.table import Column, Floats, Ints, Table, TableError, many
+from aeropend_ident.tables.units import CLOCK, TURN, UNITS, Unit, UnitError, known, parse, told
+
+CHANNELS = {"theta": "theta", "omega": "omega", "current": "i_a", "voltage": "v_a", "duty": "duty"}
+"""What a user calls a quantity -> the channel of a recording."""
+
+SHOWN_IN = {"theta": ("deg", 180.0 / math.pi), "omega": ("rad/s", 1.0), "current": ("A", 1.0), "voltage": ("V", 1.0),
+            "duty": ("%", 100.0), "reference": ("deg", 180.0 / math.pi)}
+"""Units in which ranges are told."""
+
+CLIPPED = 0.005
+"""By how much a duty may be outside 0..1."""
+
+REST = 1.0
+"""s at the start or the end in which the arm is to be at rest, for `zero`."""
+
+STILL = math.radians(3.0)
+"""Range of the angle of an arm at rest, rad."""
+
+SLOW, FAST = 10.0, 2e4
+"""Hz below and above which it is said that a recording is slow, or its time in doubt."""
+
+FAR = 2.0 * TURN
+"""rad from hanging beyond which an angle is in doubt."""
+
+LATEST = float(2**31)
+"""s that a stamp can hold."""
+
+_ZERO = re.compile(r"^([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\d\s].*)?$")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the columns of a table are, as a person says it.
+
+    Attributes:
+        time, theta, duty, omega, current, voltage, reference: "COLUMN" or "COLUMN:UNIT".
+        rate: of the rows, Hz, where no column tells the time.
+        zero: the reading of the hanging arm: "-83", "-83deg", "start" or "end".
+        flip: the reading falls when the arm is lifted.
+        motor_off: the duty is 0 all the time.
+        clock: one of `clock.CLOCKS`.
+        skip_bad: leave rows out that cannot be read.
+    """
+
+    time: str | None = None
+    theta: str | None = None
+    duty: str | None = None
+    omega: str | None = None
+    current: str | None = None
+    voltage: str | None = None
+    reference: str | None = None
+    rate: float | None = None
+    zero: str | None = None
+    flip: bool = False
+    motor_off: bool = False
+    clock: str = "auto"
+    skip_bad: bool = False
+
+    def columns(self) -> dict[str, str]:
+        """Quantity -> what is said of it."""
+        return {name: said for name in UNITS if (said := getattr(self, name)) is not None}
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """The samples of a rig, on their stamps.
+
+    Attributes:
+        stamp_ns: (N,) instants of sampling, rising, ns.
+        channels: theta, omega, i_a, v_a, duty, as far as they were measured -> (N,) SI; NaN where a reading is missing.
+        reference: (N,) rad or rad/s, or None.
+        rows: how many of the N are rows of the table.
+        period: s between samples.
+        mapping: what was taken for what, one line each.
+        notes: what was noticed and repaired, one line each.
+        left_out: columns that nothing was taken from.
+    """
+
+    stamp_ns: Ints
+    channels: dict[str, Floats]
+    reference: Floats | None
+    rows: int
+    period: float
+    mapping: tuple[str, ...]
+    notes: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+def samples(table: Table, plan: Plan) -> Samples:
+    """Take the samples of a rig from a table.
+
+    Raises:
+        TableError: that is not possible; one line that says why.
+    """
+    if plan.time is None and plan.rate is None:
+        raise TableError(no_time(table))
+    chosen = {name: _chosen(table, name, said) for name, said in plan.columns().items()}
+    twice = [name for name, (k, _) in chosen.items() if [j for j, _ in chosen.values()].count(k) > 1]
+    if twice:
+        raise TableError(f"{table.path}: column {table.label(chosen[twice[0]][0])} is given as "
+                         f"{' and as '.join(twice)}")
+    notes = list(table.notes)
+    keep = _readable_rows(table, [k for k, _ in chosen.values()], plan, notes)
+    columns = [table.columns[k] for k, _ in chosen.values()]
+    for (k, _), column in zip(chosen.values(), columns):
+        if not np.isfinite(column.values[keep]).any():
+            raise TableError(f"{table.path}: column {table.label(k)} holds no number")
+    dated = _date(table, plan, chosen, keep)
+    notes += dated.notes
+    values = {name: _placed(dated, keep, table.columns[k].values) for name, (k, _) in chosen.items()}
+    for name in values.keys() - {"time"}:
+        missing = int(np.isnan(values[name][dated.rows >= 0]).sum())
+        if missing:
+            notes.append(f"{name}: {many(missing, 'row')} without a reading")
+    channels: dict[str, Floats] = {}
+    offset = sign = 0.0
+    if "theta" in chosen:
+        channels["theta"], offset, sign = _angle(table, chosen["theta"], values["theta"], dated, plan, notes)
+    for name in ("omega", "current", "voltage"):
+        if name in chosen:
+            channels[CHANNELS[name]] = chosen[name][1].size * values[name]
+    if "duty" in chosen:
+        channels["duty"] = _duty(table, chosen["duty"], values["duty"], notes)
+    elif plan.motor_off:
+        channels["duty"] = np.zeros(len(dated.time))
+    if not channels.keys() - {"duty"}:
+        raise TableError(f"{table.path}: nothing measured is named: give --theta at least")
+    reference = None
+    if "reference" in chosen:
+        unit = chosen["reference"][1]
+        reference = unit.size * values["reference"]
+        if not unit.is_speed and sign:
+            reference = sign * (reference - offset)
+    first = float(dated.time[0])
+    if not abs(first) + float(np.ptp(dated.time)) < LATEST:
+        raise TableError(f"{table.path}: its time reaches {dated.time[-1]:.4g} s: is the unit of the time right?")
+    notes += _doubts(table, chosen, channels, dated)
+    if first < 0.0:
+        notes.append(f"time begins at {first:g} s: shifted to begin at 0")
+    start = max(round(first * 1e9), 0)
+    stamps = start + np.rint((dated.time - first) * 1e9).astype(np.int64)
+    used = {k for k, _ in chosen.values()}
+    return Samples(
+        stamp_ns=stamps, channels=channels, reference=reference, rows=dated.measured, period=dated.period,
+        mapping=tuple(_told(table, plan, chosen, channels, reference)), notes=tuple(notes),
+        left_out=tuple(table.label(k) for k in range(len(table.columns)) if k not in used),
+    )
+
+
+def _doubts(table: Table, chosen: dict[str, tuple[int, Unit]], channels: dict[str, Floats], dated: Dated) -> list[str]:
+    """What may be a mistake of the person, one line each."""
+    notes = []
+    rate = 1.0 / float(np.median(np.diff(dated.time[dated.rows >= 0])))
+    if rate > FAST:
+        notes.append(f"{rate:.4g} rows a second: is the unit of the time right?")
+    if rate < SLOW:
+        notes.append(f"{rate:.3g} rows a second are few: below {SLOW:g} not much can be told from a recording")
+    if "theta" in channels and np.nanmax(np.abs(channels["theta"])) > FAR:
+        notes.append("theta goes round more than twice: are its unit and its zero right?")
+    for name, (k, unit) in chosen.items():
+        own = table.columns[k].unit
+        theirs = known(name, own) if own else None
+        if theirs is not None and unit.size != UNITS[name][theirs]:
+            notes.append(f"{name}: you say {unit.text}, the file says {own}")
+    return notes
+
+
+def no_time(table: Table) -> str:
+    """Why a table without a time is no recording."""
+    return (f"{table.path}: no time: give --time COLUMN, or --rate HZ for evenly spaced rows; a table of steady states "
+            f"({many(len(table), 'row')}) is no recording, but bench_test takes it")
+
+
+def find(table: Table, text: str) -> list[tuple[int, str]]:
+    """Columns that "COLUMN" or "COLUMN:UNIT" may mean, with the unit, the longest name first."""
+    places = [len(text), *(k for k in range(len(text) - 1, 0, -1) if text[k] == ":")]
+    for k in places:
+        name, unit = text[:k].strip(), text[k + 1 :].strip()
+        named = [(n, column) for n, column in enumerate(table.columns) if column.name]
+        for found in ([n for n, column in named if column.name == name],
+                      [n for n, column in named if _plain(column.name) == _plain(name)],
+                      [n for n, column in named if column.unit and _plain(_bare(column)) == _plain(name)]):
+            if found:
+                return [(n, unit) for n in found]
+        if name.isdecimal() and 1 <= int(name) <= len(table.columns):
+            return [(int(name) - 1, unit)]
+    return []
+
+
+def _bare(column: Column) -> str:
+    """The name of a column without its unit."""
+    end = re.sub(r"\s*[\[(<{/_]?\s*" + re.escape(column.unit) + r"\s*[\])>}]?\s*$", "", column.name)
+    return end or column.name
+
+
+def _plain(text: str) -> str:
+    """Letters without case, accents and repeated blanks."""
+    letters = unicodedata.normalize("NFKD", " ".join(text.casefold().split()))
+    return "".join(letter for letter in letters if not unicodedata.combining(letter))
+
+
+def _chosen(table: Table, quantity: str, text: str) -> tuple[int, Unit]:
+    found = find(table, text)
+    option = f"--{quantity} '{text}'"
+    if not found:
+        there = ", ".join(table.label(k) for k in range(len(table.columns)))
+        raise TableError(f"{table.path}: {option}: there is no such column; its columns are {there}")
+    if len(found) > 1:
+        there = " and ".join(table.label(k) for k, _ in found)
+        raise TableError(f"{table.path}: {option} may be column {there}: give its number")
+    k, said = found[0]
+    column = table.columns[k]
+    if column.is_clock != (quantity == "time" and said in ("", CLOCK) and column.is_clock):
+        raise TableError(f"{table.path}: {option}: column {table.label(k)} holds times of day"
+                         + (": leave the unit away" if quantity == "time" else ", not numbers"))
+    if said == CLOCK and not column.is_clock:
+        raise TableError(f"{table.path}: {option}: column {table.label(k)} holds no times of day ({column.shown[:1]})")
+    if column.is_clock:
+        return k, Unit(CLOCK, 1.0)
+    if not said:
+        unit = known(quantity, column.unit) if column.unit else None
+        if unit is None:
+            raise TableError(f"{table.path}: {option}: say the unit of column {table.label(k)}, as in "
+                             f"--{quantity} '{text}:{next(iter(UNITS[quantity]))}'; known: {told(quantity)}")
+        return k, parse(quantity, unit)
+    try:
+        return k, parse(quantity, said)
+    except UnitError as error:
+        raise TableError(f"{table.path}: {option}: {error}") from None
+
+
+def _readable_rows(table: Table, used: list[int], plan: Plan, notes: list[str]) -> Ints:
+    """The rows that can be read, in all the columns that are used."""
+    complaints = [(int(table.bad[0]), table.complaint)] if len(table.bad) else []
+    columns = [table.columns[k] for k in used]
+    complaints += [(int(column.bad[0]), column.complaint) for column in columns if len(column.bad)]
+    if not complaints:
+        return np.arange(len(table))
+    text = any(column.is_text for column in columns)
+    if not plan.skip_bad or text:
+        raise TableError(min(complaints)[1] + "; mend it, or give --skip-bad to leave such rows out" * (not text))
+    bad = np.unique(np.concatenate([table.bad, *(table.columns[k].bad for k in used)]))
+    notes.append(f"{many(len(bad), 'row')} that cannot be read left out, first: "
+                 f"{min(complaints)[1].removeprefix(f'{table.path}: ')}")
+    return np.setdiff1d(np.arange(len(table)), bad)
+
+
+def _date(table: Table, plan: Plan, chosen: dict[str, tuple[int, Unit]], keep: Ints) -> Dated:
+    if len(keep) < 3:
+        raise TableError(f"{table.path}: {many(len(keep), 'row')}: too few for a recording")
+    if plan.time is None:
+        assert plan.rate is not None
+        full = clock.at_rate(len(table), plan.rate)
+        return Dated(full.time[keep], np.arange(len(keep)), full.period, ())
+    number, unit = chosen["time"]
+    angle = table.columns[chosen["theta"][0]].values[keep] if "theta" in chosen else np.full(len(keep), np.nan)
+    column = table.columns[number]
+    try:
+        return clock.date(unit.size * column.values[keep], angle, table.lines[keep], is_clock=column.is_clock,
+                          tick=unit.size, repeats=_repeats(table)[keep], clock=plan.clock,
+                          lengths=None if table.lengths is None else table.lengths[keep])
+    except ClockError as error:
+        raise TableError(f"{table.path}: {error}") from None
+
+
+def _repeats(table: Table) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Rows that repeat the one before to the last cell."""
+    same = np.ones(len(table), dtype=bool)
+    same[:1] = False
+    for column in table.columns:
+        v = column.values
+        same[1:] &= (v[1:] == v[:-1]) | (np.isnan(v[1:]) & np.isnan(v[:-1]))
+    return same
+
+
+def _placed(dated: Dated, keep: Ints, values: Floats) -> Floats:
+    """Values of rows on the samples, NaN where nothing was measured."""
+    return np.where(dated.rows >= 0, values[keep][dated.rows], np.nan)
+
+
+def _angle(table: Table, chosen: tuple[int, Unit], raw: Floats, dated: Dated, plan: Plan, notes: list[str]
+           ) -> tuple[Floats, float, float]:
+    """The angle from hanging, what is subtracted from readings in rad, and their sign."""
+    unit = chosen[1]
+    read = unit.size * raw
+    known_ = np.flatnonzero(np.isfinite(read))
+    steps = np.diff(read[known_])
+    wrapped = int((np.abs(steps) > 0.6 * TURN).sum())
+    unwrap = wrapped > 0 and float(np.ptp(read[known_])) < 1.02 * TURN
+    if unwrap:
+        read[known_] = np.unwrap(read[known_])
+        notes.append(f"theta passes the end of its turn {many(wrapped, 'time')}: counted on")
+    offset = 0.0 if plan.zero is None else _zero(table, plan.zero, unit, read, dated)
+    sign = -1.0 if plan.flip else 1.0
+    theta = sign * (read - offset)
+    if unwrap:
+        turns = round(float(np.median(theta[known_])) / TURN) * TURN
+        theta, offset = theta - turns, offset + sign * turns
+    return theta, offset, sign
+
+
+def _zero(table: Table, text: str, unit: Unit, read: Floats, dated: Dated) -> float:
+    """The reading of the hanging arm, rad."""
+    if text in ("start", "end"):
+        near = dated.time <= dated.time[0] + REST if text == "start" else dated.time >= dated.time[-1] - REST
+        part = read[near & np.isfinite(read)]
+        if not len(part):
+            raise TableError(f"{table.path}: --zero {text}: there is no angle in the "
+                             f"{'first' if text == 'start' else 'last'} {REST:g} s")
+        moved = float(np.ptp(np.percentile(part, (2, 98))))
+        if moved > STILL:
+            raise TableError(f"{table.path}: --zero {text}: the arm moves by {math.degrees(moved):.1f} deg in the "
+                             f"{'first' if text == 'start' else 'last'} {REST:g} s: give what is read when it hangs")
+        return float(np.median(part))
+    match = _ZERO.match(text.strip())
+    if match is None:
+        raise TableError(f"{table.path}: --zero '{text}': give a reading, as in --zero -83deg, or start or end where "
+                         "the arm hangs at rest there")
+    number, own = float(match.group(1)), match.group(2)
+    if own is None:
+        return unit.size * number
+    try:
+        return parse("theta", own).size * number
+    except UnitError as error:
+        raise TableError(f"{table.path}: --zero '{text}': {error}") from None
+
+
+def _duty(table: Table, chosen: tuple[int, Unit], raw: Floats, notes: list[str]) -> Floats:
+    unit = chosen[1]
+    duty = unit.size * (raw - unit.low)
+    low, high = float(np.nanmin(duty)), float(np.nanmax(duty))
+    if low < -CLIPPED or high > 1.0 + CLIPPED:
+        worst = float(np.nanmin(raw)) if low < -CLIPPED else float(np.nanmax(raw))
+        why = ("the motor of the model turns one way only" if low < -CLIPPED and high <= 1.0 + CLIPPED else
+               "is its unit right?")
+        raise TableError(f"{table.path}: column {table.label(chosen[0])} as a duty in {unit.text} goes to {worst:g}, "
+                         f"outside 0..100 %: {why}")
+    outside = int(((duty < 0.0) | (duty > 1.0)).sum())
+    if outside:
+        notes.append(f"duty: {many(outside, 'row')} outside 0..100 % by less than {100.0 * CLIPPED:g} %: clipped")
+    return np.clip(duty, 0.0, 1.0)
+
+
+def _told(table: Table, plan: Plan, chosen: dict[str, tuple[int, Unit]], channels: dict[str, Floats],
+          reference: Floats | None) -> list[str]:
+    """What was taken for what, with ranges."""
+    lines = []
+    if plan.time is None:
+        lines.append(f"time: {plan.rate:g} rows a second, as you say")
+    for name, (k, unit) in chosen.items():
+        said = plan.columns()[name]
+        as_file = "" if find(table, said)[0][1] else ", as the file says"
+        kind = ", times of day" if unit.text == CLOCK else f" in {unit.text}{as_file}"
+        line = f"{name}: column {table.label(k)}{kind}"
+        if name == "theta":
+            line += f", hanging at {plan.zero}" * (plan.zero is not None) + ", flipped" * plan.flip
+        values = reference if name == "reference" else channels.get(CHANNELS.get(name, ""))
+        if values is not None:
+            shown, size = ("rad/s", 1.0) if unit.is_speed else SHOWN_IN[name]
+            line += f"; {size * np.nanmin(values):.4g} to {size * np.nanmax(values):.4g} {shown}"
+        lines.append(line)
+    if plan.motor_off:
+        lines.append("duty: 0 all the time, as you say")
+    return lines

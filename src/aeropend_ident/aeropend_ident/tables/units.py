@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the numbers of a table mean: quantities, their units in the spellings of many languages, and sizes in SI."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+DEGREE = math.pi / 180.0
+TURN = 2.0 * math.pi
+RPM = TURN / 60.0
+
+CLOCK = "clock"
+"""The unit of a time of day or a date; the values are s already."""
+
+ANGLES = {
+    "deg": DEGREE, "rad": 1.0, "turn": TURN, "mrad": 1e-3, "°": DEGREE, "º": DEGREE, "degree": DEGREE,
+    "degrees": DEGREE, "degs": DEGREE, "grad": DEGREE, "grados": DEGREE, "graus": DEGREE, "gradi": DEGREE,
+    "degrés": DEGREE, "graden": DEGREE, "stopnie": DEGREE, "град": DEGREE, "度": DEGREE,
+    "radian": 1.0, "radians": 1.0, "рад": 1.0, "turns": TURN, "rev": TURN, "revs": TURN,
+}  # fmt: skip
+SPEEDS = {
+    "rad/s": 1.0, "rpm": RPM, "deg/s": DEGREE, "turn/s": TURN, "Hz": TURN, "rads": 1.0, "rad_s": 1.0, "rad/sec": 1.0,
+    "rad·s⁻¹": 1.0, "rad s^-1": 1.0, "rad*s^-1": 1.0, "1/min": RPM, "min-1": RPM, "min^-1": RPM, "min⁻¹": RPM,
+    "U/min": RPM, "u/min": RPM, "Upm": RPM, "tr/min": RPM, "giri/min": RPM, "rev/min": RPM, "r/min": RPM,
+    "omw/min": RPM, "ob/min": RPM, "об/мин": RPM, "rps": TURN, "rev/s": TURN, "U/s": TURN, "°/s": DEGREE,
+    "grad/s": DEGREE, "1/s": TURN,
+}  # fmt: skip
+UNITS: dict[str, dict[str, float]] = {
+    "time": {
+        "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "day": 86400.0, CLOCK: 1.0, "µs": 1e-6,
+        "μs": 1e-6, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "sek": 1.0, "sekunden": 1.0, "sekunde": 1.0,
+        "seg": 1.0, "segundos": 1.0, "secondes": 1.0, "secondi": 1.0, "с": 1.0, "сек": 1.0, "мс": 1e-3, "秒": 1.0,
+        "毫秒": 1e-3, "msec": 1e-3, "millis": 1e-3, "millisec": 1e-3, "milliseconds": 1e-3, "usec": 1e-6,
+        "micros": 1e-6, "microseconds": 1e-6, "days": 86400.0, "d": 86400.0,
+    },
+    "theta": ANGLES,
+    "duty": {"%": 1e-2, "1": 1.0, "‰": 1e-3, "percent": 1e-2, "pct": 1e-2, "prozent": 1e-2, "-": 1.0, "fraction": 1.0},
+    "omega": SPEEDS,
+    "current": {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6, "μA": 1e-6, "amp": 1.0, "amps": 1.0, "ampere": 1.0,
+                "а": 1.0, "ма": 1e-3},
+    "voltage": {"V": 1.0, "mV": 1e-3, "volt": 1.0, "volts": 1.0, "в": 1.0, "мв": 1e-3},
+    "reference": {**ANGLES, **SPEEDS},
+}  # fmt: skip
+"""Quantity -> unit -> its size in SI; the units in Latin letters that come first are those that are told to users."""
+
+TOLD = {"time": 8, "theta": 4, "duty": 3, "omega": 5, "current": 3, "voltage": 2, "reference": 4}
+"""How many units of each quantity are told."""
+
+COUNTED = ("theta", "duty", "reference")
+"""Quantities that may be given in counts."""
+
+_SIZED = re.compile(r"^([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*\*?\s*(\S.*)$")
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)"
+_COUNTS = re.compile(rf"^counts:({_NUMBER})(?:\.\.({_NUMBER}))?$", re.IGNORECASE)
+_BRACKETS = re.compile(r"^(.*?)\s*[\[(<{]\s*([^\])>}]*?)\s*[\])>}]\s*$")
+_SLASH = re.compile(r"^(.*?\S)\s*(?:/| in )\s*(\S+)$")
+_TAIL = re.compile(r"^(.*[^_\s])_(deg|rad|rpm|ms|us|sec|s|mA|A|mV|V|pct|percent|rad_s|counts)$")
+
+
+class UnitError(ValueError):
+    """A unit is not known; the message is part of a line for a person."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """What a number of a table means: SI value = (number - low) * size.
+
+    Attributes:
+        text: as a user would write it.
+        size: of one in the table, SI.
+        low: the number that stands for zero.
+        is_speed: a reference that is a speed (rad/s), not an angle.
+    """
+
+    text: str
+    size: float
+    low: float = 0.0
+    is_speed: bool = False
+
+
+def known(quantity: str, text: str) -> str | None:
+    """The unit of a quantity that is spelled like this, in the spelling of `UNITS`; None when there is none."""
+    text = text.strip()
+    units = UNITS[quantity]
+    if text in units:
+        return text
+    same = [unit for unit in units if unit.casefold() == text.casefold().rstrip(".")]
+    return same[0] if len({units[unit] for unit in same}) == 1 else None
+
+
+def parse(quantity: str, text: str) -> Unit:
+    """Read a unit: `deg`, `0.1deg` (one in the table is 0.1 degrees), `counts:1024`, `counts:1000..2000`.
+
+    Counts of an angle are those of a full turn; of a duty, those of full duty, or those of none and of full.
+
+    Raises:
+        UnitError: it is none of this quantity.
+    """
+    counts = _COUNTS.match(text.strip())
+    if counts and quantity in COUNTED:
+        first, second = float(counts.group(1)), counts.group(2)
+        if quantity != "duty":
+            if second is not None or first <= 0.0:
+                raise UnitError(f"'{text}': counts of an angle are those of a full turn, as in counts:1024")
+            return Unit(text, TURN / first)
+        low, high = (first, float(second)) if second is not None else (0.0, first)
+        if low == high:
+            raise UnitError(f"'{text}': counts of a duty are those of full duty, or of none and full, as in counts:255 "
+                            "or counts:1000..2000")
+        return Unit(text, 1.0 / (high - low), low)
+    unit, factor = known(quantity, text), 1.0
+    if unit is None:
+        sized = _SIZED.match(text.strip())
+        unit = known(quantity, sized.group(2)) if sized else None
+        factor = float(sized.group(1)) if sized else 1.0
+        if unit is None or factor == 0.0:
+            raise UnitError(f"'{text}' is no unit of {quantity}: give {told(quantity)}")
+    if unit == CLOCK and factor != 1.0:
+        raise UnitError(f"'{text}': a time of day has no size")
+    return Unit(text.strip(), factor * UNITS[quantity][unit], is_speed=unit in SPEEDS and quantity == "reference")
+
+
+def told(quantity: str) -> str:
+    """The units of a quantity, for a person."""
+    names = list(UNITS[quantity])[: TOLD[quantity]]
+    if quantity == "duty":
+        return ", ".join(names) + ", counts:255 (those of full duty) or counts:1000..2000 (of none and of full)"
+    return ", ".join(names) + (" or counts:1024 (those of a turn)" if quantity in COUNTED else "")
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """Split a column's name into name and unit: 'angle [deg]', 'angle (deg)', 'angle / deg', 'angle_deg'.
+
+    Returns:
+        The name, and the unit as it is written; "" where it has none that is known.
+    """
+    if is_unit(name):
+        return name.strip(), name.strip()
+    for pattern in (_BRACKETS, _SLASH, _TAIL):
+        match = pattern.match(name.strip())
+        if match and is_unit(match.group(2)):
+            return match.group(1).strip(), match.group(2)
+    return name.strip(), ""
+
+
+def is_unit(text: str) -> bool:
+    """Whether a word is a unit of any quantity."""
+    return any(known(quantity, text) is not None for quantity in UNITS) or text.casefold() in ("counts", "lsb", "ticks")
+
+
+def without_brackets(text: str) -> str:
+    """A unit as in a line of units: '[s]', '(deg)', 'V'."""
+    return text.strip().strip("[](){}<>").strip()

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The candidate terms of sparse identification: the thesis' library of 31, and terms that a user gives.
+
+A term is a product of factors: `theta`, `omega^1.8`, `sin(theta)`, `theta_dot*abs(theta_dot)`, or `1`.
+x^n is |x|^n with the sign of x where n is not a whole number.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+POWER, SIN, COS, ABS, SIGN = range(5)
+_FUNCTIONS = {"sin": SIN, "cos": COS, "abs": ABS, "sign": SIGN}
+_FACTOR = re.compile(r"(?:(?P<call>[a-z]+)\((?P<inner>\w+)\)|(?P<name>[A-Za-z_]\w*))(?:\^(?P<power>[0-9.]+))?$")
+
+
+class TermError(ValueError):
+    """A term cannot be read; the message is one line for a person."""
+
+
+class Factor(NamedTuple):
+    """One factor of a term: the kind of function, the column of its variable, its power (of `POWER` only)."""
+
+    kind: int
+    variable: int
+    power: float
+
+
+class Table(NamedTuple):
+    """A library for compiled code: term j is the product of the factors first[j] to first[j + 1]."""
+
+    first: Indices
+    kind: Indices
+    variable: Indices
+    power: Array
+
+
+@dataclass(frozen=True)
+class Library:
+    """Candidate terms over named variables.
+
+    Attributes:
+        variables: names of the columns, states first, then inputs.
+        names: of the terms.
+        table: the same for compiled code.
+    """
+
+    variables: tuple[str, ...]
+    names: tuple[str, ...]
+    table: Table
+
+    @classmethod
+    def of(cls, variables: Sequence[str], names: Sequence[str]) -> Library:
+        """A library of terms by name.
+
+        Raises:
+            TermError: a term is not understood, names an unknown variable, or is given twice.
+        """
+        factors = [parse(name, variables) for name in names]
+        if len(set(names)) < len(names):
+            twice = next(name for k, name in enumerate(names) if name in names[:k])
+            raise TermError(f"the term '{twice}' is given twice")
+        flat = [f for one in factors for f in one]
+        table = Table(np.cumsum([0, *map(len, factors)], dtype=np.int64),
+                      np.array([f.kind for f in flat], dtype=np.int64),
+                      np.array([f.variable for f in flat], dtype=np.int64),
+                      np.array([f.power for f in flat], dtype=float))
+        return cls(tuple(variables), tuple(names), table)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __call__(self, values: Array) -> Array:
+        """The terms (N, terms) for variables (N, len(variables))."""
+        values = np.ascontiguousarray(values, dtype=float)
+        out = np.empty((len(values), len(self)))
+        for j, name in enumerate(self.names):
+            column = np.ones(len(values))
+            for factor in parse(name, self.variables):
+                column = column * _apply(factor, values[:, factor.variable])
+            out[:, j] = column
+        return out
+
+
+def parse(term: str, variables: Sequence[str]) -> list[Factor]:
+    """The factors of a term; none for `1`.
+
+    Raises:
+        TermError: not understood, or an unknown variable.
+    """
+    if term == "1":
+        return []
+    factors = []
+    for text in term.replace(" ", "").split("*"):
+        match = _FACTOR.match(text)
+        call = match and match["call"]
+        if match is None or (call and (call not in _FUNCTIONS or match["power"])):
+            raise TermError(f"the term '{term}' is not understood at '{text}': write products of {', '.join(variables)}"
+                            ", of powers as in omega^1.8, and of sin(), cos(), abs(), sign() of one")
+        name = match["inner"] or match["name"]
+        if name not in variables:
+            raise TermError(f"the term '{term}' has the unknown variable '{name}'; known: {', '.join(variables)}")
+        try:
+            power = float(match["power"] or 1.0)
+        except ValueError:
+            raise TermError(f"the term '{term}' has the power '{match['power']}', which is no number") from None
+        factors.append(Factor(_FUNCTIONS[call] if call else POWER, list(variables).index(name), power))
+    return factors
+
+
+def thesis_terms(variables: Sequence[str]) -> list[str]:
+    """The thesis' library: 1, each variable, each product of two, sine and cosine of each (31 terms for 5)."""
+    return [*polynomials(variables, 2), *(f"{f}({v})" for v in variables for f in ("sin", "cos"))]
+
+
+def polynomials(variables: Sequence[str], degree: int) -> list[str]:
+    """Names of all products of the variables up to a degree."""
+    names, last = ["1"], [("", 0)]
+    for _ in range(degree):
+        last = [(f"{name}*{v}".lstrip("*"), j) for name, start in last for j, v in enumerate(variables) if j >= start]
+        names += [name for name, _ in last]
+    return names
+
+
+def _apply(factor: Factor, x: Array) -> Array:
+    if factor.kind == SIN:
+        return np.sin(x)
+    if factor.kind == COS:
+        return np.cos(x)
+    if factor.kind == ABS:
+        return np.abs(x)
+    if factor.kind == SIGN:
+        return np.sign(x)
+    if factor.power == 1.0:
+        return x
+    if factor.power == np.floor(factor.power):
+        return np.asarray(x**int(factor.power))
+    return np.asarray(np.sign(x) * np.abs(x) ** factor.power)
+
+
+@njit(cache=True, error_model="numpy")
+def factor_at(kind: int, power: float, x: float) -> tuple[float, float]:
+    """A factor and its slope."""
+    if kind == SIN:
+        return np.sin(x), np.cos(x)
+    if kind == COS:
+        return np.cos(x), -np.sin(x)
+    if kind == ABS:
+        return abs(x), np.sign(x)
+    if kind == SIGN:
+        return np.sign(x), 0.0
+    if power == 1.0:
+        return x, 1.0
+    if power == 2.0:
+        return x * x, 2.0 * x
+    if power == np.floor(power):
+        return x**power, power * x ** (power - 1.0)
+    size = abs(x)
+    return np.sign(x) * size**power, power * size ** (power - 1.0) if size > 0.0 else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def terms_at(x: Array, which: Indices, table: Table, value: Array, slope: Array) -> None:
+    """Fill value[j] and slope[j, :] of the terms `which` at variables x (V,); slope may have no rows: left out."""
+    with_slope = slope.shape[0] > 0
+    for j in which:
+        product = 1.0
+        a, b = table.first[j], table.first[j + 1]
+        if with_slope:
+            for k in range(slope.shape[1]):
+                slope[j, k] = 0.0
+        for f in range(a, b):
+            v, d = factor_at(table.kind[f], table.power[f], x[table.variable[f]])
+            product *= v
+            if with_slope:
+                rest = d
+                for k in range(a, b):
+                    if k != f:
+                        w, _ = factor_at(table.kind[k], table.power[k], x[table.variable[k]])
+                        rest *= w
+                slope[j, table.variable[f]] += rest
+        value[j] = product

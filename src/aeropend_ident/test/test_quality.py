@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+
+from aeropend_ident.quality import main, planned, quality
+from aeropend_ident.recording import RecordingError
+from aeropend_sim.excitation import Excitation
+from aeropend_sim.parameters import load
+
+BENCH = load("bench")
+
+
+def test_a_rich_input_excites_every_term():
+    rich = quality(BENCH, planned(BENCH, Excitation(duration=20.0).series()))
+    assert {(e.equation, e.term) for e in rich} == {
+        ("theta_dot", "sin(theta)"), ("theta_dot", "theta_dot"), ("theta_dot", "omega*omega"), ("i_a", "i_a"),
+        ("i_a", "omega"), ("i_a", "v_a"), ("omega", "i_a"), ("omega", "omega*omega")}
+    assert not any(e.poor for e in rich)
+
+
+def test_a_single_step_leaves_terms_undetermined(capsys):
+    assert main(["--kind", "hold", "--duration", "10"]) == 0
+    said = capsys.readouterr().out
+    assert "cannot be told from" in said
+    assert "would stay undetermined" in said
+
+
+def test_an_input_that_does_nothing_is_refused(capsys):
+    with pytest.raises(RecordingError):
+        planned(BENCH, np.zeros(5000))
+    assert main(["--duration", "1"]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rigs whose numbers nobody knows: what their recordings say of themselves, and what is found on top of it."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from blind import bags
+from rigs import BENCH, drawn_rig, steps
+
+from aeropend_ident.diagnose import main
+from aeropend_ident.gap.diagnosis import diagnose
+from aeropend_ident.gap.signals import Signals
+from aeropend_ident.gap.unknown_rig import free_swings, grid, noise, reading_sigma, resolution, signals_from
+from aeropend_ident.recording import Recording, RecordingError
+from aeropend_sim import dynamics, rig
+from aeropend_sim.parameters import SAMPLE_PERIOD, Model, load
+
+DEGREE = math.radians(1.0)
+
+
+def recording(t, theta, duty=None, **channels):
+    """Readings (N,) at t (N,) as a bag would give them; what is not given was not measured."""
+    n = len(t)
+    stamps = np.rint(np.asarray(t) * 1e9).astype(np.int64)
+    nothing, never, no_time = np.full(n, np.nan), np.empty(0), np.empty(0, np.int64)
+    given = {"theta": theta, "duty": duty, **channels}
+    columns = {c: np.asarray(given[c], float) if given.get(c) is not None else nothing
+               for c in ("theta", "omega", "i_a", "v_a", "duty")}
+    return Recording(path="bag", namespace="/", stamp_ns=stamps, received_ns=stamps, t=(stamps - stamps[0]) / 1e9,
+                     **columns, channels=("theta",), period=float(np.median(np.diff(t))),
+                     gaps=np.empty((0, 2), np.int64), duplicates=0, command_ns=no_time, command=never,
+                     reference_ns=no_time, reference=never, truth=None, complete=True, notes=())
+
+
+def let_go(seconds, effects=None, gravity=40.0, damping=0.4, first=1.0, rate=20.0, lsb=DEGREE, seed=0, held=0.5,
+           zero=0.0):
+    """Readings of an arm that is held, let go and left alone: t, theta."""
+    model = Model("arm", {**BENCH.model, "mgd_over_J": gravity, "c_over_J": damping}, BENCH.sensing, effects or {})
+    every = 5
+    n = round((seconds - held) * rate) * every + 1
+    out = np.empty((2, n))
+    dynamics.run_arm(np.zeros(n), dynamics.State(theta=first), *dynamics.prepare(model, 1.0 / rate / every), out)
+    theta = np.concatenate([np.full(round(held * rate), first), out[0, ::every]]) + zero
+    theta = theta + 0.2 * lsb * np.random.default_rng(seed).standard_normal(len(theta))
+    return np.arange(len(theta)) / rate, np.round(theta / lsb) * lsb if lsb else theta
+
+
+def verdict(*signals: Signals):
+    return diagnose(BENCH, list(signals), 2, fit_nominal=True).body
+
+
+def candidate(body, effect):
+    return next(c for c in body["which"]["candidates"] if c["effect"] == effect)
+
+
+def test_resolution_is_the_step_between_values():
+    x = np.random.default_rng(0).standard_normal(500)
+    assert resolution(np.round(x / 0.0175) * 0.0175) == pytest.approx(0.0175, rel=1e-6)
+    assert resolution(x) == 0.0
+    assert resolution(np.round(np.round(x / 0.05678) * 0.05678, 5)) == pytest.approx(0.05678, rel=1e-3)
+
+
+@pytest.mark.parametrize("rate", [20.0, 490.0])
+def test_noise_is_told_from_motion(rate):
+    t = np.arange(0.0, 20.0, 1.0 / rate)
+    x = np.sin(6.0 * t) + 0.003 * np.random.default_rng(1).standard_normal(len(t))
+    assert noise(t, x) == pytest.approx(0.003, rel=0.25)
+    assert reading_sigma(t, np.round(x / 0.1) * 0.1) == pytest.approx(0.1 / math.sqrt(12.0), rel=0.3)
+
+
+def test_the_grid_takes_steady_stamps_as_they_are_and_makes_a_finer_one_for_others():
+    steady = np.rint(np.arange(400) * 2.0408e6).astype(np.int64)
+    index, period = grid(steady)
+    assert period == pytest.approx(2.0408e-3, rel=1e-5)
+    assert np.array_equal(index, np.arange(400))
+    bursts = np.cumsum(np.tile([5, 5, 5, 5, 5, 5, 5, 128], 30)) * 1_000_000
+    index, period = grid(bursts)
+    assert np.abs(index * period - (bursts - bursts[0]) * 1e-9).max() < 0.6e-3
+    _, period = grid(np.arange(200) * 50_000_000, longest=5e-3)
+    assert 0.05 / period == pytest.approx(round(0.05 / period))
+    assert period <= 5e-3
+
+
+def test_a_push_begins_a_new_swinging():
+    _, a = let_go(6.0, first=1.0, lsb=0.0)
+    _, b = let_go(8.0, first=0.8, lsb=0.0)
+    swings = free_swings(np.concatenate([a, b]), 1e-3)
+    assert len([s for s in swings if s.count >= 4]) == 2
+    assert max(swings, key=lambda s: s.stop).size == pytest.approx(1.6, abs=0.2)
+
+
+def test_a_viscous_swing_lacks_nothing_and_tells_its_numbers():
+    body = verdict(signals_from(recording(*let_go(9.0, zero=0.1)), BENCH.sensing))
+    assert (body["which"]["verdict"], body["which"]["effects"]) == ("none", [])
+    numbers = body["which"]["numbers"]
+    for name, true in (("mgd_over_J", 40.0), ("c_over_J", 0.4)):
+        assert numbers[name]["determined"]
+        assert numbers[name]["low"] - 0.01 * true < true < numbers[name]["high"] + 0.01 * true
+    assert {"R_a", "K_e", "k_thrust", "L_over_J"} <= set(body["identified"]["not_determined"])
+    assert body["identified"]["hangs_at"]["value"] == pytest.approx(0.1, abs=0.01)
+    json.dumps(body, allow_nan=False)
+
+
+@pytest.mark.parametrize(("effect", "parameters"), [("coulomb_friction", {"accel": 1.0}),
+                                                    ("quadratic_drag", {"k": 0.15})])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_brakes_a_swing_is_named_at_20_hz_and_one_degree(effect, parameters, seed):
+    t, theta = let_go(6.0, {effect: parameters}, damping=0.05, seed=seed)
+    body = verdict(signals_from(recording(t, theta), BENCH.sensing))
+    assert body["which"]["verdict"] == effect
+    (name, true), = parameters.items()
+    found = candidate(body, effect)["parameters"][name]
+    assert found["low"] < true < found["high"]
+    assert body["shrink"]["closed"] > 0.8
+
+
+def test_stamps_in_bursts_do():
+    t, theta = let_go(8.0, {"coulomb_friction": {"accel": 1.0}}, rate=200.0, lsb=1e-3)
+    kept = np.arange(len(t)) % 34 < 8
+    shifted = t[kept] + 0.0023 * (np.arange(len(t)) // 34 % 2)[kept]
+    body = verdict(signals_from(recording(shifted, theta[kept]), BENCH.sensing))
+    assert body["which"]["verdict"] == "coulomb_friction"
+
+
+def test_runs_that_differ_are_no_effect_and_their_spread_is_told():
+    runs = [let_go(8.0, gravity=g, damping=c, first=a, seed=k)
+            for k, (g, c, a) in enumerate([(40.0, 0.4, 1.0), (42.0, 0.5, 0.8), (39.0, 0.45, 1.2)])]
+    body = verdict(*(signals_from(recording(*run), BENCH.sensing) for run in runs))
+    assert body["which"]["effects"] == []
+    gravity = body["which"]["numbers"]["mgd_over_J"]
+    assert [r["value"] for r in gravity["runs"]] == pytest.approx([40.0, 42.0, 39.0], rel=0.01)
+    assert gravity["run_to_run"] == pytest.approx(1.53, rel=0.1)
+
+
+def test_an_arm_that_thrust_holds_cannot_be_diagnosed_without_the_command():
+    parts = [let_go(4.0, first=a, held=0.2, damping=1.5)[1] for a in (0.6, 0.7, 0.5)]
+    theta = np.concatenate(parts) + math.radians(100.0)
+    with pytest.raises(RecordingError, match=r"pushed \d times and comes to rest at 100 degrees.*without the command"):
+        signals_from(recording(np.arange(len(theta)) / 20.0, theta), BENCH.sensing)
+    with pytest.raises(RecordingError, match="does not swing down freely"):
+        signals_from(recording(np.arange(400) / 20.0, np.repeat([0.0, 0.4, 0.2, 0.5], 100)), BENCH.sensing)
+
+
+def unknown(seed, effects=None, duration=30.0, factor=0.5, **kept):
+    """A recording of a rig with numbers off by a factor; of its channels those kept are there."""
+    rng = np.random.default_rng(seed)
+    model = drawn_rig(seed, effects or {}, 0.0)
+    numbers = {k: v * math.exp(factor * rng.uniform(-1.0, 1.0)) for k, v in model.model.items()}
+    model = replace(model, model={**numbers, "k1": model.model["k1"], "L_over_J": model.model["L_over_J"] *
+                                  numbers["mgd_over_J"] / model.model["mgd_over_J"]})
+    duty = steps(duration, seed, 0.45)
+    columns, _ = rig.record(model, duty, seed)
+    t = np.arange(len(duty)) * SAMPLE_PERIOD
+    return model, recording(t, columns["theta"], duty, **{c: columns[c] for c in kept})
+
+
+def test_angle_and_command_alone_name_an_effect_in_a_rig_that_nobody_knows():
+    model, read = unknown(3, {"coulomb_friction": {"accel": 0.8}})
+    body = verdict(signals_from(read, BENCH.sensing))
+    assert body["which"]["verdict"] == "coulomb_friction"
+    accel = candidate(body, "coulomb_friction")["parameters"]["accel"]
+    assert accel["value"] == pytest.approx(0.8, rel=0.15)
+    for name in ("mgd_over_J", "c_over_J"):
+        assert body["which"]["numbers"][name]["value"] == pytest.approx(model.model[name], rel=0.05)
+    assert not body["which"]["numbers"]["R_a"]["determined"]
+
+
+def test_all_channels_give_the_numbers_of_a_rig_that_nobody_knows():
+    model, read = unknown(4, omega=True, i_a=True, v_a=True)
+    body = verdict(signals_from(read, BENCH.sensing))
+    assert body["which"]["effects"] == []
+    for name in ("R_a", "L_a", "K_e", "mgd_over_J", "c_over_J"):
+        row = body["which"]["numbers"][name]
+        assert row["determined"]
+        assert row["value"] == pytest.approx(model.model[name], rel=0.03)
+    assert not body["which"]["numbers"]["K_t"]["determined"]  # only K_t over J_m shows
+
+
+def bag(path, t, theta):
+    """A bag of an angle alone."""
+    nothing = np.full(len(theta), np.nan)
+    bags.write(path, {"theta": theta, "omega": nothing, "i_a": nothing, "v_a": nothing, "duty": nothing},
+               round((t[1] - t[0]) * 1e9))
+    return str(path)
+
+
+def test_the_command_takes_bags_without_a_command(tmp_path, capsys):
+    swing = bag(tmp_path / "swing", *let_go(8.0, {"coulomb_friction": {"accel": 1.0}}))
+    assert main([swing, "--fit-nominal", "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert "verdict: coulomb_friction (arm)" in said
+    assert "not determined: k0" in said
+    assert load(tmp_path / "out" / "augmented.yaml").effects["coulomb_friction"]["accel"] == pytest.approx(1.0, rel=0.2)
+    assert "coulomb_friction" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_the_command_says_in_one_line_why_it_cannot_tell(tmp_path, capsys):
+    swing = let_go(4.0, damping=1.5, held=0.2)[1]
+    theta = np.tile(swing, 3) + math.radians(100.0)
+    held = bag(tmp_path / "held", np.arange(len(theta)) / 20.0, theta)
+    assert main([held, "--fit-nominal", "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "no verdict is possible without the command" in error
+    assert not (tmp_path / "out").exists()
