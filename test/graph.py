@@ -16,18 +16,30 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from aeropend_sim import interface
 
 MODULES = {
     "plant": "aeropend_sim.plant",
+    "pose": "aeropend_sim.pose",
+    "bridge": "aeropend_bridge.bridge",
+    "calibrate": "aeropend_bridge.calibrate",
     "excite": "aeropend_control.excite",
+    "small_signal": "aeropend_control.base small_signal",
+    "feedback_linearization": "aeropend_control.base feedback_linearization",
+    "cascade": "aeropend_control.base cascade",
+    "feedback_linearization_cascade": "aeropend_control.base feedback_linearization_cascade",
+    "reference": "aeropend_control.reference",
+    "step_test": "aeropend_control.step_test",
     "record": "aeropend_ident.record",
     "replay": "aeropend_ident.replay",
     "diagnose": "aeropend_ident.diagnose",
 }
 PATIENCE_S = 60.0
 """How long a test waits for what must come: discovery and a first compilation take long on a loaded machine."""
+AGAIN_S = 5.0
+"""How long a service may take before it is asked again, s."""
 
 
 def isolate() -> None:
@@ -38,7 +50,7 @@ def isolate() -> None:
 
 
 class Process:
-    """A command in a process of its own; its output goes to one file.
+    """A command in a process of its own, stopped when a `with` is left; its output goes to one file.
 
     Args:
         name: a key of MODULES.
@@ -46,10 +58,19 @@ class Process:
     """
 
     def __init__(self, name: str, *args: str) -> None:
+        self.name = name
         self._output = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
-        self.popen = subprocess.Popen(
-            [sys.executable, "-m", MODULES[name], *args], stdout=self._output, stderr=subprocess.STDOUT
-        )
+        self.popen = subprocess.Popen(self.command(*args), stdout=self._output, stderr=subprocess.STDOUT)
+
+    def command(self, *args: str) -> list[str]:
+        """What is run."""
+        return [sys.executable, "-m", *MODULES[self.name].split(), *args]
+
+    def __enter__(self) -> "Process":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
 
     @property
     def output(self) -> str:
@@ -132,6 +153,25 @@ class Graph:
             self._executor.spin_once(timeout_sec=0.02)
         return result
 
+    def shown(self, topic: str) -> dict[str, dict[str, list[TopicEndpointInfo]]] | None:
+        """The publishers and the subscriptions, by topic, of the one process that publishes a topic; None: not known.
+
+        Asked by process, not by node: which node an entity belongs to travels in messages of which one may be lost for
+        good when two processes send theirs at once (https://github.com/ros2/rmw_fastrtps/issues/792).
+        """
+        processes = {_process(info) for info in self.node.get_publishers_info_by_topic(topic)}
+        if len(processes) != 1:
+            return None
+        found: dict[str, dict[str, list[TopicEndpointInfo]]] = {"publishers": {}, "subscriptions": {}}
+        for name, _ in self.node.get_topic_names_and_types():
+            for kind, infos in (
+                ("publishers", self.node.get_publishers_info_by_topic(name)),
+                ("subscriptions", self.node.get_subscriptions_info_by_topic(name)),
+            ):
+                if own := [info for info in infos if _process(info) in processes]:
+                    found[kind][name] = own
+        return found
+
     @contextmanager
     def listening(self, kind: type, topic: str) -> Iterator[list[Any]]:
         """Collect the messages of a topic, from when its publisher is known."""
@@ -155,13 +195,22 @@ class Graph:
             self.node.destroy_publisher(publisher)
 
     def call(self, kind: type, service: str, request: Any) -> Any:
-        """Call a service and return its response."""
+        """Call a service and return its response.
+
+        A server that does not know the client's ear yet answers in vain, so a request without an answer is repeated.
+        """
         client = self.node.create_client(kind, service)
+        asked: list[Any] = []
         try:
             self.until(client.service_is_ready, f"service {service}")
-            future = client.call_async(request)
-            self.until(future.done, f"an answer of {service}")
-            return future.result()
+            begun = time.monotonic()
+
+            def answered() -> Any:
+                if time.monotonic() > begun + len(asked) * AGAIN_S:
+                    asked.append(client.call_async(request))
+                return next((future for future in asked if future.done()), None)
+
+            return self.until(answered, f"an answer of {service}").result()
         finally:
             self.node.destroy_client(client)
 
@@ -178,6 +227,11 @@ class Graph:
                 return None
 
             return self.until(find, f"diagnostics of {name}")
+
+
+def _process(info: TopicEndpointInfo) -> tuple[int, ...]:
+    """The process an endpoint lives in: the prefix of its id (DDSI-RTPS 2.5, section 8.2.4)."""
+    return tuple(info.endpoint_gid[:12])
 
 
 def stamps(messages: Sequence[Any]) -> list[int]:

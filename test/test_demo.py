@@ -12,6 +12,8 @@ import pytest
 
 from aeropend_sim.parameters import load
 
+pytestmark = pytest.mark.live
+
 
 def demo(*arguments: object) -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, "-m", "aeropend_ident.demo", *map(str, arguments)],

@@ -16,40 +16,39 @@ PERIOD_NS = 2_040_000
 JOINT_STATE, BATTERY_STATE = "sensor_msgs/msg/JointState", "sensor_msgs/msg/BatteryState"
 
 
-def endpoint(graph, find, topic):
-    """The only publisher or subscription of a topic, once discovery has told its node as well."""
-
-    def known():
-        infos = find(topic)
-        return infos[0] if [info.node_name for info in infos] == ["plant"] else None
-
-    return graph.until(known, f"the plant on {topic}")
-
-
 @pytest.mark.parametrize("namespace", ["", "/left"])
 def test_topics_types_and_qos(graph, start, namespace):
     remap = ["--ros-args", "-r", f"__ns:={namespace}"] if namespace else []
     start("plant", *remap, *parameters(publish_truth=True))
-    for topic, kind in {
+    published = {
         f"{namespace}/{JOINT_STATES}": JOINT_STATE,
         f"{namespace}/{ARMATURE}": BATTERY_STATE,
         f"{namespace}/{TRUTH_JOINT_STATES}": JOINT_STATE,
         f"{namespace}/{TRUTH_ARMATURE}": BATTERY_STATE,
         DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
-    }.items():
-        info = endpoint(graph, graph.node.get_publishers_info_by_topic, topic)
+    }
+    command = f"{namespace}/duty_command"
+
+    def shown():
+        found = graph.shown(f"{namespace}/{JOINT_STATES}")
+        return found if found and published.keys() <= found["publishers"].keys() and found["subscriptions"] else None
+
+    found = graph.until(shown, "the plant's topics")
+    for topic, kind in published.items():
+        (info,) = found["publishers"][topic]
         assert info.topic_type == kind
         assert info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
         assert info.qos_profile.durability == DurabilityPolicy.VOLATILE
         assert info.qos_profile.history in (HistoryPolicy.KEEP_LAST, HistoryPolicy.UNKNOWN)  # not part of discovery
         assert info.qos_profile.depth in (100, 0)
-    command = endpoint(graph, graph.node.get_subscriptions_info_by_topic, f"{namespace}/duty_command")
-    assert command.topic_type == "std_msgs/msg/Float64"
-    assert command.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+    assert set(found["subscriptions"]) == {command}
+    (info,) = found["subscriptions"][command]
+    assert info.topic_type == "std_msgs/msg/Float64"
+    assert info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
 
     def services():
-        known = dict(graph.node.get_service_names_and_types_by_node("plant", namespace or "/"))
-        return known if {f"{namespace}/enable", f"{namespace}/reset"} <= set(known) else None
+        known = dict(graph.node.get_service_names_and_types())
+        return known if {f"{namespace}/enable", f"{namespace}/reset"} <= known.keys() else None
 
     offered = graph.until(services, "the services")
     assert offered[f"{namespace}/enable"] == ["std_srvs/srv/SetBool"]
@@ -57,14 +56,11 @@ def test_topics_types_and_qos(graph, start, namespace):
 
 
 def test_truth_and_clock_are_off_by_default(graph, start):
-    # a name of its own: the plant of the test before may linger in the graph under load
-    start("plant", "--ros-args", "-r", "__node:=plain")
-    expected = {"/joint_states", "/armature", "/diagnostics", "/parameter_events", "/rosout"}
+    start("plant", "--ros-args", "-r", "__ns:=/plain")
+    expected = {"/plain/joint_states", "/plain/armature", "/diagnostics", "/parameter_events", "/rosout"}
 
     def topics():
-        if "plain" not in graph.node.get_node_names():
-            return set()
-        return {name for name, _ in graph.node.get_publisher_names_and_types_by_node("plain", "/")}
+        return set((graph.shown(f"/plain/{JOINT_STATES}") or {}).get("publishers", ()))
 
     graph.until(lambda: expected <= topics(), "the plant's topics")
     assert topics() == expected

@@ -2,18 +2,16 @@
 """The plant and the recorder as real processes, beside what most people write with rclpy and rosbags."""
 
 import os
-import signal
 import struct
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
+import graph
 import numpy as np
 import rclpy
+from graph import PATIENCE_S, parameters
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -33,34 +31,26 @@ PERIOD_NS = round(SAMPLE_PERIOD * 1e9)
 PEERS = Path(__file__).parent / "peers"
 NAMESPACE = f"/bench_{os.getpid()}"
 """Of every node: another rig on this machine may have hit on the same domain."""
-PATIENCE_S = 60.0
-"""How long a process may take to be heard: discovery takes seconds on a loaded machine."""
 SETTLE_S = 3.0
 """Start-up that is not measured."""
 
 
-def isolate() -> None:
-    """Keep this process and those it starts on this machine and in a domain of their own."""
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    os.environ["ROS_DOMAIN_ID"] = str(os.getpid() % 102)
-    os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="aeropend_log_")
+class Process(graph.Process):
+    """One of our commands as it is installed, or a peer's file, in the benchmark's namespace."""
 
+    def command(self, *args: str) -> list[str]:
+        """What is run.
 
-class Process:
-    """One of our commands, or a peer's file, as a process."""
-
-    def __init__(self, name: str, *args: str) -> None:
-        command = [str(Path(sys.executable).parent / name)]
-        if name.endswith(".py"):
-            command = [sys.executable, str(PEERS / name)]
+        Raises:
+            NotMeasuredError: it is not installed.
+        """
+        command = [str(Path(sys.executable).parent / self.name)]
+        if self.name.endswith(".py"):
+            command = [sys.executable, str(PEERS / self.name)]
         elif not Path(command[0]).exists():
             raise NotMeasuredError(f"there is no {command[0]}: run make demo or make test once")
-        if "--ros-args" not in args:
-            args = (*args, "--ros-args")
-        self.name = name
-        self._output = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
-        command += [*args, "-r", f"__ns:={NAMESPACE}"]
-        self.popen = subprocess.Popen(command, stdout=self._output, stderr=subprocess.STDOUT)
+        ros = [] if "--ros-args" in args else ["--ros-args"]
+        return [*command, *args, *ros, "-r", f"__ns:={NAMESPACE}"]
 
     def cpu_s(self) -> float:
         """CPU time used so far, s."""
@@ -70,34 +60,8 @@ class Process:
     def check(self) -> None:
         """Raise when it has ended by an error."""
         if self.popen.poll():
-            self._output.seek(0)
-            said = " ".join(self._output.read().decode().split())[-300:]
+            said = " ".join(self.output.split())[-300:]
             raise NotMeasuredError(f"{self.name} ended with {self.popen.returncode}: {said}")
-
-    def stop(self) -> None:
-        """End it as Ctrl-C does; kill it when it does not."""
-        if self.popen.poll() is None:
-            self.popen.send_signal(signal.SIGINT)
-        try:
-            self.popen.wait(30.0)
-        except subprocess.TimeoutExpired:
-            self.popen.kill()
-            self.popen.wait()
-
-
-@contextmanager
-def running(name: str, *args: str) -> Iterator[Process]:
-    """A process that is stopped at the end, whatever happens."""
-    process = Process(name, *args)
-    try:
-        yield process
-    finally:
-        process.stop()
-
-
-def parameters(**values: object) -> list[str]:
-    """The ROS arguments that set parameters."""
-    return ["--ros-args", *(word for name, value in values.items() for word in ("-p", f"{name}:={value}"))]
 
 
 class Listener:
@@ -141,7 +105,7 @@ def rhythm(name: str, seconds: float) -> dict[str, float]:
     """Run something that publishes samples, and measure ticks missed, lateness (ms) and CPU (% of a core)."""
     listener = Listener()
     try:
-        with running(name) as process:
+        with Process(name) as process:
             listener.wait(process)
             listener.listen(process, SETTLE_S)
             cpu, start = process.cpu_s(), time.monotonic()
@@ -182,8 +146,8 @@ def plant(quick: bool) -> list[Figure]:
 
 def recorded(recorder: str, seconds: float, bag: Path) -> dict[str, float]:
     """Record plant and excite, and count what is missing in the bag."""
-    with running("plant") as plant_, running("excite", *parameters(duration=seconds + 60.0)) as excite:
-        with running(recorder, str(bag)) as process:
+    with Process("plant") as plant_, Process("excite", *parameters(duration=seconds + 60.0)) as excite:
+        with Process(recorder, str(bag)) as process:
             listening = time.monotonic() + PATIENCE_S
             while not (bag.exists() and _grows(bag)):
                 process.check()

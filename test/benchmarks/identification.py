@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sparse identification: which terms are found, how near to the Cramér-Rao limit, and how fast, beside pysindy."""
+
+import math
+import os
+import subprocess
+import sys
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeropend_ident import dataset, lorenz
+from aeropend_ident.dataset import STATES
+from aeropend_ident.derivatives import tv_derivative
+from aeropend_ident.discrepancy import nominal
+from aeropend_ident.identify import Identified, identify
+from aeropend_ident.output_error import Entries, Experiment, Fitter, Output
+from aeropend_ident.recording import RecordingError
+from aeropend_ident.sindy import regress
+from aeropend_ident.thesis import LIBRARY, SECONDS, given, mismatched, missing, noisy, rates, states, truth
+from aeropend_ident.weak import Weak
+from aeropend_sim import rig
+from aeropend_sim.excitation import Excitation
+from aeropend_sim.parameters import SAMPLE_PERIOD, load
+from benchmarks import measure
+from benchmarks.measure import Figure, NotMeasuredError, Spread, Target, interleaved
+
+Array = NDArray[np.float64]
+
+SEEDS, QUICK = 20, 3
+
+
+def limits(seed: int, sigma: Array) -> dict[tuple[str, str], float]:
+    """Cramér-Rao 1 sigma of every true coefficient, from all 70 s."""
+    x, v = states(seed)
+    true = truth(load("thesis"))
+    matrix = np.array([[true[s].get(t, 0.0) for t in LIBRARY.names] for s in STATES])
+    outputs = tuple(Output(s, k, x[:, k], float(sigma[k])) for k, s in enumerate(STATES))
+    fitter = Fitter(Experiment(LIBRARY, v[:, None].copy(), SAMPLE_PERIOD, x, outputs, free_states=4),
+                    Entries.of(matrix))
+    run = fitter.run(*fitter.point)
+    assert run is not None
+    normal, _ = fitter.normal(run, fitter.model, fitter.residuals(run))
+    sd = np.sqrt(np.diag(np.linalg.inv(normal.H)))
+    return {(STATES[e], LIBRARY.names[t]): float(s)
+            for e, t, s in zip(fitter.model.equation, fitter.model.term, sd)}
+
+
+def errors(found: Identified, true: dict[str, dict[str, float]]) -> float:
+    """Largest relative error of a coefficient; inf where terms are wrong."""
+    if not lorenz.is_exact(found.equations, true):
+        return math.inf
+    return max((abs(found.equations[s][t] / c - 1.0) for s, e in true.items() for t, c in e.items()), default=0.0)
+
+
+def exact(quick: bool) -> list[Figure]:
+    """Noise-free data of `thesis`: terms and coefficients by every method (thesis 5.2 and 5.4)."""
+    about = measure.load()
+    true, absent, known = truth(load("thesis")), missing(), nominal(mismatched())
+    figures = []
+    for method, target in (("sindy", 1e-8), ("weak", 1e-4), ("discrepancy-sindy", 1e-3), ("discrepancy-weak", 1e-3)):
+        off = []
+        for seed in range(QUICK if quick else SEEDS):
+            derivatives = rates(seed) if method.endswith("sindy") else None
+            found = identify(given(*states(seed), derivatives), method, known=known)
+            off.append(errors(found, absent if method.startswith("discrepancy") else true))
+        figures.append(Figure(f"noise-free thesis, {method}: largest relative error (inf: wrong terms)", "-",
+                              Spread.of(max(off)), Target(target), details={"each": off}, load=about))
+    return figures
+
+
+def noise(quick: bool) -> list[Figure]:
+    """The thesis' noisy setting: 70 s of `thesis`, 50 dB; then 40 and 30 dB."""
+    figures = []
+    true = truth(load("thesis"))
+    for decibel in (50.0, 40.0, 30.0):
+        about = measure.load()
+        right, ratios, thrust, seconds = [], [], [], []
+        lost: dict[str, int] = {}
+        for seed in range(QUICK if quick else SEEDS):
+            y, sigma = noisy(seed, decibel)
+            found = identify(given(y, states(seed)[1]), "weak")
+            right.append(float(lorenz.is_exact(found.equations, true)))
+            seconds.append(found.seconds)
+            limit = limits(seed, sigma)
+            for (s, t), sd in limit.items():
+                if t in found.equations[s]:
+                    ratios.append(abs(found.equations[s][t] - true[s][t]) / sd)
+            for s in STATES:
+                for t in set(found.equations[s]) ^ set(true[s]):
+                    lost[f"{s}: {t}"] = lost.get(f"{s}: {t}", 0) + 1
+            got = found.equations["theta_dot"].get("omega*omega", math.inf)
+            thrust.append(abs(got / true["theta_dot"]["omega*omega"] - 1.0))
+        name = f"{decibel:.0f} dB, weak"
+        aim = decibel == 50.0
+        figures += [
+            Figure(f"{name}: seeds with exactly the true terms", "-", Spread.of(float(np.mean(right))),
+                   Target(0.95, at_least=True) if aim else None, details={"wrong": lost, "seconds": seconds},
+                   note="; ".join(f"{k} {n} times" for k, n in lost.items()), load=about),
+            Figure(f"{name}: error over the Cramér-Rao 1 sigma, 95 % quantile", "-",
+                   Spread.of(float(np.quantile(ratios, 0.95))), Target(3.0) if aim else None, load=about),
+            Figure(f"{name}: K_q, largest relative error", "-", Spread.of(max(thrust)), Target(0.01) if aim else None,
+                   load=about)]
+    return figures
+
+
+def chain(quick: bool) -> list[Figure]:
+    """Recordings of `bench` through its measurement chain: terms of θ̈, and free runs on held-out data."""
+    about = measure.load()
+    model = load("bench")
+    true = truth(model)
+    arm, every, worst, seconds = [], [], [], []
+    for seed in range(QUICK if quick else SEEDS):
+        duty = Excitation(duration=SECONDS, seed=seed).series()
+        read, _ = rig.record(model, duty, seed)
+        try:
+            found = identify(dataset.from_readings({**read, "duty": duty}, SAMPLE_PERIOD, model.sensing), "weak")
+        except RecordingError:  # it said that it cannot tell
+            arm, every, worst = [*arm, 0.0], [*every, 0.0], [*worst, math.inf]
+            continue
+        arm.append(float(set(found.equations["theta_dot"]) == set(true["theta_dot"])))
+        every.append(float(lorenz.is_exact(found.equations, true)))
+        worst.append(max((r.gap / r.floor for r in found.free_run.values()), default=math.inf))
+        seconds.append(found.seconds)
+    return [Figure("bench recording, weak: seeds with exactly the terms of θ̈", "-", Spread.of(float(np.mean(arm))),
+                   Target(0.95, at_least=True), details={"each": arm, "seconds": seconds}, load=about),
+            Figure("bench recording, weak: seeds with exactly the terms of all", "-", Spread.of(float(np.mean(every))),
+                   details={"each": every}, load=about),
+            Figure("bench recording, weak: free run on held-out data over its floor, worst channel", "-",
+                   Spread.of(worst), Target(2.0), details={"each": worst}, load=about)]
+
+
+def study(quick: bool) -> list[Figure]:
+    """The Lorenz system with 5 % noise, beside pysindy's weak form with a threshold that knows the answer."""
+    about = measure.load()
+    true = lorenz.truth("weak")
+    seeds = range(QUICK if quick else SEEDS)
+    ours = [float(lorenz.is_exact(lorenz.study("weak", 0.05, seed).equations, true)) for seed in seeds]
+    peer = [float(lorenz.is_exact(_pysindy_lorenz(seed), true)) for seed in seeds]
+    return [Figure("Lorenz, 5 % noise: runs with exactly the true terms", "-", Spread.of(float(np.mean(ours))),
+                   Target(0.9, at_least=True), "pysindy weak form, STLSQ 0.5", Spread.of(float(np.mean(peer))),
+                   load=about)]
+
+
+def _pysindy() -> Any:
+    try:
+        import pysindy
+    except ImportError:
+        raise NotMeasuredError("pysindy is not installed: pip install -r requirements-dev.txt") from None
+    return pysindy
+
+
+def _pysindy_lorenz(seed: int) -> dict[str, dict[str, float]]:
+    ps = _pysindy()
+    x = lorenz.data(0.05, seed).values
+    t = np.arange(len(x)) * lorenz.PERIOD
+    np.random.seed(seed)  # noqa: NPY002 - pysindy draws its domains from there
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        weak = ps.WeakPDELibrary(ps.PolynomialLibrary(degree=lorenz.DEGREE), spatiotemporal_grid=t, K=200)
+        model = ps.SINDy(feature_library=weak, optimizer=ps.STLSQ(threshold=0.5))
+        model.fit(x, t=lorenz.PERIOD)
+    # its polynomials come in the same order as ours: by degree, then by variable
+    names = lorenz.polynomials(lorenz.STATES, lorenz.DEGREE)
+    matrix = model.coefficients()
+    if matrix.shape[1] != len(names):
+        raise NotMeasuredError(f"pysindy's weak library has {matrix.shape[1]} terms, not {len(names)}")
+    return {s: {names[j]: float(c) for j, c in enumerate(row) if c != 0.0} for s, row in zip(lorenz.STATES, matrix)}
+
+
+def speed(quick: bool) -> list[Figure]:
+    """Weak form with selection on 34,313 x 31, and peak memory of the whole identification; beside pysindy."""
+    about = measure.load()
+    y, _ = noisy(0, 50.0)
+    v = states(0)[1]
+    held = v[:, None].copy()
+
+    def ours() -> None:
+        problem = Weak(LIBRARY, y, held, SAMPLE_PERIOD)
+        for k in range(len(STATES)):
+            regress(problem, k)
+
+    ps = _pysindy()
+    t = np.arange(len(y)) * SAMPLE_PERIOD
+    inner = ps.ConcatLibrary([ps.PolynomialLibrary(degree=2), ps.FourierLibrary(n_frequencies=1)])
+
+    def peer() -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            weak = ps.WeakPDELibrary(inner, spatiotemporal_grid=t, K=1000)
+            ps.SINDy(feature_library=weak, optimizer=ps.STLSQ(threshold=0.9)).fit(y, u=v, t=SAMPLE_PERIOD)
+
+    mine, theirs = interleaved(1 if quick else 5, ours, peer)
+    tv, = interleaved(1 if quick else 5, lambda: tv_derivative(y[:, 0], SAMPLE_PERIOD))
+    # VmHWM, in kB: ru_maxrss would start from this process's own
+    code = ("from benchmarks import identification as b; from aeropend_ident.identify import identify; "
+            "y, _ = b.noisy(0, 50.0); identify(b.given(y, b.states(0)[1]), 'weak'); "
+            "print(next(int(x.split()[1]) / 1024 for x in open('/proc/self/status') if x.startswith('VmHWM')))")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False,
+                          env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)})
+    if done.returncode:
+        raise NotMeasuredError(f"the memory of identify: {done.stderr.strip().splitlines()[-1]}")
+    return [Figure("weak form with selection, 34,313 samples x 31 terms", "s CPU", Spread.of(mine), Target(2.0),
+                   "pysindy weak form (K 1000), STLSQ", Spread.of(theirs), Spread.of(mine / theirs), load=about),
+            Figure("TVRegDiff, 34,313 samples, strength chosen", "s CPU", Spread.of(tv), Target(1.0), load=about),
+            Figure("identify weak, 34,313 x 31, refinement included: peak memory", "MiB",
+                   Spread.of(float(done.stdout)), Target(500.0), load=about)]
