@@ -19,7 +19,7 @@ ifneq ($(CURDIR)$(PYTHON),$(shell cat .venv/.tree 2>/dev/null))
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test bench lint clean distclean
+.PHONY: help demo test bench blind lint clean distclean
 
 help: ## show this
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile | expand -t 18
@@ -27,21 +27,27 @@ help: ## show this
 demo: .venv/.runtime ## run a plant with a hidden effect and name it (EFFECT=coulomb_friction pins one, ARGS="--help")
 	$(BIN)/demo $(if $(EFFECT),--effect $(EFFECT)) $(ARGS)
 
-# pytest comes last, its summary closes the output.
+# First what only computes, on every core, then what runs nodes. Exit code 5: ARGS chose none of these.
 test: .venv/.dev ## build and test with colcon in a temporary folder, then run every test (ARGS="-k plant")
+	tools/setup firmware
+	$(MAKE) -C firmware
 	tools/colcon-check
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n auto --dist loadscope -m "not live" $(ARGS) || [ $$? = 5 -a -n "$(ARGS)" ]
+	$(BIN)/python -m pytest -m live $(ARGS) || [ $$? = 5 -a -n "$(ARGS)" ]
 
 bench: .venv/.runtime ## measure speed beside C and scipy
 	tools/setup compiler
 	$(BIN)/python test/bench.py $(ARGS)
+
+blind: .venv/.dev ## diagnose recordings of withheld effects, then open their labels (ARGS="--count 60 --seed 7")
+	PYTHONPATH=test $(BIN)/python -m blind $(ARGS)
 
 lint: .venv/.dev ## check style and types
 	$(BIN)/ruff check
 	$(BIN)/mypy
 
 clean: ## remove what building and testing left
-	rm -rf build install log .mypy_cache .pytest_cache .ruff_cache src/*/build src/*/*.egg-info
+	rm -rf build install log .mypy_cache .pytest_cache .ruff_cache .hypothesis src/*/build src/*/*.egg-info firmware/build
 	find . -path ./.venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean ## remove .venv too
