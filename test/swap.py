@@ -9,7 +9,6 @@ Run as a command, `python test/swap.py`, it does with every law what the suite d
 
 import json
 import os
-import signal
 import statistics
 import subprocess
 import sys
@@ -55,9 +54,17 @@ class EmulatedBoard(NamedTuple):
         return time.time_ns()
 
 
+class NoBoardError(Exception):
+    """The emulated board did not start; the message is one line that says why."""
+
+
 @contextmanager
-def emulated_board(*args: str) -> Iterator[EmulatedBoard]:
-    """The emulated board."""
+def emulated_board(*args: str | Path) -> Iterator[EmulatedBoard]:
+    """The emulated board, stopped when it is left.
+
+    Raises:
+        NoBoardError: it did not start.
+    """
     with tempfile.TemporaryDirectory(prefix="aeropend_board_") as folder, tempfile.TemporaryFile() as output:
         link = Path(folder) / "tty"
         program = subprocess.Popen(
@@ -66,13 +73,14 @@ def emulated_board(*args: str) -> Iterator[EmulatedBoard]:
         try:
             end = time.monotonic() + PATIENCE_S
             while not link.exists():
-                output.seek(0)
-                assert program.poll() is None, output.read().decode()
-                assert time.monotonic() < end, "the emulated board never came"
+                if program.poll() is not None or time.monotonic() > end:
+                    output.seek(0)
+                    said = output.read().decode().strip().splitlines()
+                    raise NoBoardError(f"emulated_board did not start: {said[-1] if said else 'no port'}")
                 time.sleep(0.02)
             yield EmulatedBoard(link, program)
         finally:
-            program.send_signal(signal.SIGINT)
+            program.terminate()
             program.wait()
 
 

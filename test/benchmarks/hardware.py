@@ -3,11 +3,9 @@
 
 import random
 import struct
-import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import combinations
 from pathlib import Path
 
@@ -17,6 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from graph import PATIENCE_S, parameters
 from numpy.typing import NDArray
 from std_msgs.msg import Float64
+from swap import NoBoardError, emulated_board
 
 from aeropend_bridge import protocol
 from aeropend_sim import interface
@@ -24,32 +23,10 @@ from benchmarks import measure
 from benchmarks.measure import Figure, NotMeasuredError, Spread, Target
 from benchmarks.nodes import NAMESPACE, SETTLE_S, Listener, Process, Stamps
 
-EMULATED_BOARD = Path(__file__).parents[2] / "firmware" / "emulator" / "emulated_board"
 RATE_HZ = 16e6 / (64 * 510)
 TRIALS = 1_000_000
 SHORTEST_S, LONGEST_S = 0.006, 0.02
 """Between commands: never in step with the samples, each well before the next."""
-
-
-@contextmanager
-def board(truth: Path) -> Iterator[Path]:
-    """The emulated board, which writes what really was; gives its port."""
-    link = truth.parent / "tty"
-    with tempfile.TemporaryFile() as output:
-        process = subprocess.Popen([EMULATED_BOARD, "--link", link, "--truth", truth],
-                                   stdin=subprocess.DEVNULL, stdout=output, stderr=output)
-        try:
-            end = time.monotonic() + PATIENCE_S
-            while not link.exists():
-                if process.poll() is not None or time.monotonic() > end:
-                    output.seek(0)
-                    said = output.read().decode().strip().splitlines()
-                    raise NotMeasuredError(f"emulated_board did not start: {said[-1] if said else 'no port'}")
-                time.sleep(0.05)
-            yield link
-        finally:
-            process.terminate()
-            process.wait()
 
 
 class Commander(Listener):
@@ -117,13 +94,16 @@ def bridge(quick: bool) -> list[Figure]:
         truth = Path(folder) / "truth"
         listener = Commander()
         try:
-            with board(truth) as port, Process("bridge", *parameters(port=port)) as process:
+            with (emulated_board("--truth", truth) as board,
+                  Process("bridge", *parameters(port=board.port)) as process):
                 listener.wait(process)
                 listener.listen(process, SETTLE_S)
                 cpu, start = process.cpu_s(), time.monotonic()
                 stamps, sent = listener.command(process, seconds)
                 cpu, wall = process.cpu_s() - cpu, time.monotonic() - start
                 counters = listener.counters(process)
+        except NoBoardError as error:
+            raise NotMeasuredError(str(error)) from None
         finally:
             listener.close()
         rows = np.array([line.split()[:4] for line in truth.read_text().splitlines()
