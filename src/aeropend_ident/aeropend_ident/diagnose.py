@@ -7,20 +7,16 @@ Exit code 0 with a verdict, 2 with one line on standard error when the input can
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import shlex
 import sys
-import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich import box
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from aeropend_ident import many
@@ -30,8 +26,9 @@ from aeropend_ident.output import OutputError, check
 from aeropend_ident.recording import RecordingError
 from aeropend_ident.results import FILES, Results, document
 from aeropend_ident.usable import signals_of
-from aeropend_sim.command import Parser
+from aeropend_sim.command import Parser, between, own
 from aeropend_sim.parameters import PRESETS, ModelError, load
+from aeropend_sim.progress import progress
 from aeropend_sim.untrusted import printable
 
 EXAMPLES = """examples:
@@ -45,9 +42,6 @@ EXAMPLES = """examples:
   plant --ros-args --params-file verdict/augmented.yaml      run the model with what was found
 
 exit codes: 0 a verdict was written, 2 the input cannot be used (one line says why), 130 interrupted"""
-
-SILENT = 2.0
-"""s of work before progress is shown."""
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -66,7 +60,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--out", metavar="DIR",
                         help="folder for the results (default: diagnosis_<name of the bag>; with --each: diagnoses)")
     parser.add_argument("--namespace", metavar="NS", help="namespace of the rig, when a bag holds several")
-    parser.add_argument("--held-out", type=_share, default=0.3, metavar="SHARE",
+    parser.add_argument("--held-out", type=between(0.05, 0.8, "a share"), default=0.3, metavar="SHARE",
                         help="share at the end of each recording kept for testing (default: 0.3)")
     parser.add_argument("--test", action="append", default=[], metavar="BAG",
                         help="a further recording of the rig that nothing is fitted to: how far the gap closes there "
@@ -93,40 +87,13 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     return options
 
 
-def _share(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.05 <= value <= 0.8:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a share between 0.05 and 0.8")
-    return value
-
-
 def _jobs(text: str) -> int:
     if not text.isdigit() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of threads from 1 on")
     return int(text)
 
 
-@contextmanager
-def _shown(console: Console) -> Iterator[Progress]:
-    """A progress bar that shows up once the work has taken a while."""
-    bar = Progress(TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console, transient=True,
-                   disable=not console.is_terminal)
-    timer = threading.Timer(SILENT, bar.start)
-    timer.daemon = True
-    timer.start()
-    try:
-        yield bar
-    finally:
-        timer.cancel()
-        timer.join()
-        if bar.live.is_started:
-            bar.stop()
-
-
-def run(options: argparse.Namespace, command: str, console: Console) -> None:
+def run(options: argparse.Namespace, command: str) -> None:
     """Diagnose recordings of one rig together and write the results.
 
     Raises:
@@ -136,13 +103,12 @@ def run(options: argparse.Namespace, command: str, console: Console) -> None:
     out = Path(options.out or f"diagnosis_{many.names(options.bags[:1])[0]}")
     check(out, FILES, overwrite=options.overwrite)
     model = load(options.model)
-    with _shown(console) as bar:
-        task = bar.add_task("reading", total=1.0)
+    with progress("reading") as show:
         signals, tests = ([signals_of(bag, options.namespace, model.sensing, options.held_out,
                                       fit_nominal=options.fit_nominal) for bag in bags]
                           for bags in (options.bags, options.test))
         found = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal,
-                         progress=lambda what, share: bar.update(task, description=what, completed=share))
+                         progress=lambda what, share: show(share, what))
         shown = [{"bag": bag, **across(model, found.augmented, s)} for bag, s in zip(options.test, tests)]
         body = document(found, options.bags, options.model, time.monotonic() - started, shown)
         results = Results.of(found, body, command)
@@ -151,7 +117,7 @@ def run(options: argparse.Namespace, command: str, console: Console) -> None:
     print(printable(f"{out / 'report.html'}   {out / 'augmented.yaml'}   {body['seconds']} s"))
 
 
-def run_each(options: argparse.Namespace, console: Console) -> int:
+def run_each(options: argparse.Namespace) -> int:
     """Diagnose recordings of a rig each, write what is found as it comes, and a table of it; returns the exit code.
 
     Raises:
@@ -168,14 +134,13 @@ def run_each(options: argparse.Namespace, console: Console) -> int:
     commands = [_alone(options, bag, out / name) for bag, name in zip(options.bags, names)]
     rows = []
     try:
-        with many.cluster(options.dask) as client, _shown(console) as bar:
-            task = bar.add_task(f"0 of {len(names)} recordings", total=len(names))
+        with many.cluster(options.dask) as client, progress(f"0 of {len(names)} recordings", len(names)) as show:
             outcomes = many.diagnose_each(options.bags, commands, settings, options.jobs, client)
             for name, outcome in zip(names, outcomes):
                 if outcome.results is not None:
                     outcome.results.write(out / name, overwrite=options.overwrite)
                 rows.append(many.row(outcome, name))
-                bar.update(task, description=f"{len(rows)} of {len(names)} recordings", completed=len(rows))
+                show(len(rows), f"{len(rows)} of {len(names)} recordings")
     except KeyboardInterrupt:
         done = sum((out / name / "diagnosis.json").exists() for name in names)
         raise Interrupted(f"interrupted; {done} of {len(names)} verdicts are in {out}" if done else
@@ -231,14 +196,12 @@ class Interrupted(Exception):  # noqa: N818
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    if "--ros-args" in arguments:  # as a node it takes no ROS arguments, but ros2 run may pass some
-        arguments = arguments[: arguments.index("--ros-args")]
+    arguments = own(arguments)
     options = parse(arguments)
     try:
         if options.each:
-            return run_each(options, Console(stderr=True))
-        run(options, shlex.join(["diagnose", *arguments]), Console(stderr=True))
+            return run_each(options)
+        run(options, shlex.join(["diagnose", *arguments]))
     except (RecordingError, ModelError, OutputError, many.ClusterError) as error:
         print(f"diagnose: {error}", file=sys.stderr)
         return 2

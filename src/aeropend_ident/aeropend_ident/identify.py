@@ -33,8 +33,9 @@ from aeropend_ident.sindy import DERIVATIVES, Regression, regress
 from aeropend_ident.sparse import Sums, select
 from aeropend_ident.terms import Array, Library, TermError, thesis_terms
 from aeropend_ident.weak import NUMERIC, Weak, half_width, sided
-from aeropend_sim.command import Parser, interruptible, own
+from aeropend_sim.command import Parser, between, interruptible, own
 from aeropend_sim.parameters import PRESETS, ModelError, load
+from aeropend_sim.progress import Show, nothing, progress
 
 FORMAT = 1
 METHODS = ("sindy", "weak", "discrepancy-sindy", "discrepancy-weak")
@@ -103,13 +104,14 @@ class Identified:
 
 
 def identify(data: Dataset, method: str = "weak", terms: Sequence[str] | None = None, known: Equations | None = None,
-             derivative: str = "smoothed") -> Identified:
+             derivative: str = "smoothed", show: Show = nothing) -> Identified:
     """Find sparse equations of a dataset.
 
     Args:
         data: the recording. method: one of `METHODS`. terms: candidates (the thesis' library by default).
         known: for the discrepancy methods, the equations to which terms are added.
         derivative: for the SINDy methods, how derivatives are taken (`sindy.DERIVATIVES`).
+        show: how far it is, up to 1.
 
     Raises:
         TermError: a term cannot be read. RecordingError: no model could be run on the data.
@@ -124,10 +126,11 @@ def identify(data: Dataset, method: str = "weak", terms: Sequence[str] | None = 
     if not library:
         raise TermError("no terms are given: name at least one, as in sin(theta),theta_dot,omega*omega")
     problem = Problem(data, library, known)
+    show(0.05, "choosing terms by regression")
     regression = problem.regress(method.endswith("weak"), derivative)
     refined = None
     if data.derivatives is None:
-        refined = problem.refine(regression)
+        refined = problem.refine(regression, show)
         if refined is None:
             raise RecordingError(f"{data.name}: the equations found at first run away, so none are told; record "
                                  "longer, with more motion, or give fewer terms")
@@ -275,7 +278,7 @@ class Problem:
         rates = {s + dataset.RATE for s in d.states} & set(d.states)
         return [[s, s + dataset.RATE] if s + dataset.RATE in rates else [s] for s in d.states if s not in rates]
 
-    def refine(self, first: Array) -> Refined | None:
+    def refine(self, first: Array, show: Show = nothing) -> Refined | None:
         """Terms and coefficients by free runs, from a first matrix (states, terms).
 
         Where that does not follow the recording, every group of states is run alone at first, between the others as
@@ -283,13 +286,15 @@ class Problem:
         """
         d, start = self.data, self.fill(first)
         whole = self.experiment(d.train)
+        show(0.1, "fitting free runs")
         fitter = Fitter(whole, Entries.of(start), 0, floor=1.0)
         if not (fitter.fit(rounds=15) and follows(fitter)):
             better = self.alone(start.copy())
             fitter = Fitter(whole, Entries.of(better), 0, floor=1.0)
             if d.chain or (fitter.fit(rounds=15) and follows(fitter)):
-                return refine(whole, better, self.candidates, self.shot, follow=False, score=self.held_out_misfit)
-        return refine(whole, start, self.candidates, self.shot, score=self.held_out_misfit)
+                return refine(whole, better, self.candidates, self.shot, follow=False, score=self.held_out_misfit,
+                              show=show)
+        return refine(whole, start, self.candidates, self.shot, score=self.held_out_misfit, show=show)
 
     def alone(self, start: Array) -> Array:
         """Refine the groups of states one by one, between the others; the runs then describe the states better."""
@@ -503,20 +508,10 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
                         help="how the SINDy methods take derivatives (default: smoothed)")
     parser.add_argument("--out", metavar="DIR", help="folder for the results (default: identified_<name of the bag>)")
     parser.add_argument("--namespace", metavar="NS", help="namespace of the rig, when a bag holds several")
-    parser.add_argument("--held-out", type=_share, default=0.25, metavar="SHARE",
+    parser.add_argument("--held-out", type=between(0.05, 0.8, "a share"), default=0.25, metavar="SHARE",
                         help="share at the end kept for testing (default: 0.25)")
     parser.add_argument("--overwrite", action="store_true", help="replace results that are in the folder already")
     return parser.parse_args(arguments)
-
-
-def _share(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not 0.05 <= value <= 0.8:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a share between 0.05 and 0.8")
-    return value
 
 
 def run(options: argparse.Namespace) -> None:
@@ -530,10 +525,11 @@ def run(options: argparse.Namespace) -> None:
     check(out, FILES, overwrite=options.overwrite)
     model = load(options.model)
     known = nominal(model) if options.method.startswith("discrepancy") else None
-    data = dataset.from_bag(recording.read(options.bag, options.namespace), model.sensing, _listed(options.states),
-                            _listed(options.input), options.held_out)
-    found = identify(data, options.method, None if options.terms is None else _listed(options.terms), known,
-                     options.derivative)
+    with progress("reading") as show:
+        data = dataset.from_bag(recording.read(options.bag, options.namespace), model.sensing, _listed(options.states),
+                                _listed(options.input), options.held_out)
+        found = identify(data, options.method, None if options.terms is None else _listed(options.terms), known,
+                         options.derivative, show)
     body = document(found, options.bag, options.model, time.monotonic() - started)
     with whole(out, FILES) as place:
         (place / FILES[0]).write_text(json.dumps(body, indent=1, allow_nan=False) + "\n", encoding="utf-8")

@@ -8,7 +8,6 @@ Without options that say what the columns are, it shows the table and proposes t
 from __future__ import annotations
 
 import argparse
-import math
 import shlex
 import sys
 from collections.abc import Sequence
@@ -29,7 +28,7 @@ from aeropend_ident.tables.mapping import Plan, Samples, no_time, samples
 from aeropend_ident.tables.table import Table, TableError, many
 from aeropend_ident.tables.units import UNITS, told
 from aeropend_ident.tables.write import BagExistsError, write
-from aeropend_sim.command import EXIT_CODES, Parser, interruptible, own
+from aeropend_sim.command import EXIT_CODES, Parser, between, interruptible, own
 from aeropend_sim.progress import progress
 from aeropend_sim.untrusted import one_line, printable
 
@@ -68,7 +67,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
                              help=f"{about[quantity]}: {told(quantity)}".replace("%", "%%"))
     columns.add_argument("--accept", action="store_true", help="take what is proposed for the columns")
     more = parser.add_argument_group("what the table does not say")
-    more.add_argument("--rate", type=_rate, metavar="HZ", help="the rows are evenly spaced, so many a second")
+    more.add_argument("--rate", type=between(0.1, 1e6, "a rate", "Hz"), metavar="HZ",
+                      help="the rows are evenly spaced, so many a second")
     more.add_argument("--zero", metavar="READING",
                       help="what --theta reads when the arm hangs: -83deg, or a number in its unit, or `start` or "
                            "`end` where it hangs at rest there; default 0")
@@ -112,16 +112,6 @@ def _joined(arguments: Sequence[str]) -> list[str]:
         else:
             out.append(word)
     return out
-
-
-def _rate(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.1 <= value <= 1e6:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a rate between 0.1 and 1,000,000 Hz")
-    return value
 
 
 def _delimiter(text: str) -> str:

@@ -17,6 +17,7 @@ import numpy as np
 from aeropend_ident.output_error import Entries, Experiment, Fitter, Normal
 from aeropend_ident.sparse import price, smallest
 from aeropend_ident.terms import Array, Indices
+from aeropend_sim.progress import Show, nothing
 
 ROUNDS = 12
 """Times that terms are chosen anew at most."""
@@ -183,7 +184,7 @@ class Refined:
 
 
 def refine(experiment: Experiment, start: Array, candidates: Array, shot: int, *, follow: bool = True,
-           score: Score | None = None) -> Refined | None:
+           score: Score | None = None, show: Show = nothing) -> Refined | None:
     """Choose terms and coefficients by free runs.
 
     The whole recording is run at once if the first model can follow it so; if not, in shots that grow for as long as
@@ -194,6 +195,7 @@ def refine(experiment: Experiment, start: Array, candidates: Array, shot: int, *
         start: (equations, terms) a first model. candidates: (equations, terms) bool, what may be in the model.
         shot: samples of the shortest shots. follow: whether to try shots; if not, a model that runs is good enough.
         score: misfit of a fitted model on held-out data, by which unstable terms are judged; None: they are not.
+        show: how far it is, up to 1.
 
     Returns:
         None when the first model cannot be run.
@@ -214,6 +216,7 @@ def refine(experiment: Experiment, start: Array, candidates: Array, shot: int, *
             fitter = whole
         else:
             return None
+    show(0.3, "choosing terms by free runs")
     choose(fitter, every, start.shape)
     steps = fitter.steps
     fitter.refine_steps()
@@ -222,6 +225,7 @@ def refine(experiment: Experiment, start: Array, candidates: Array, shot: int, *
         choose(fitter, every, start.shape)
     unstable: list[tuple[int, int, float]] = []
     if score is not None:
+        show(0.6, "drawing the recording anew")
         linear, now, often = stabilise(fitter, every, start.shape, score, unstable)
     else:
         linear, now, _ = linearise(fitter, every, start.shape)

@@ -5,6 +5,7 @@ A shell asks for completions by running the command with `_ARGCOMPLETE` set (arg
 """
 
 import argparse
+import math
 import os
 import signal
 import sys
@@ -56,6 +57,22 @@ def own(arguments: Sequence[str] | None) -> list[str]:
     """A command line (default: the process's) without the ROS arguments that `ros2 run` may pass on."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     return given[: given.index("--ros-args")] if "--ros-args" in given else given
+
+
+def between(low: float, high: float, what: str, unit: str = "") -> Callable[[str], float]:
+    """A type of argument: a number of a range. `what` names it, as in "a share"."""
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            limits = f"between {low:,.12g} and {high:,.12g} {unit}".rstrip()
+            raise argparse.ArgumentTypeError(f"'{text}' is not {what} {limits}")
+        return value
+
+    return read
 
 
 P = ParamSpec("P")
