@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
-from aeropend_ident.recording import Recording, RecordingError
+from aeropend_ident.recording import Recording, holds
+from aeropend_ident.tables.units import RPM
 from aeropend_ident.terms import Array
 from aeropend_sim import actuator
 from aeropend_sim.parameters import PARAMETERS
@@ -214,8 +215,7 @@ def blocked_recording(recording: Recording, name: str) -> Found:
         raise BenchTestError(f"{name}: the rotor turned, so v_a is not R_a i_a; block it, or use --steady")
     if len(recording.gaps) or not np.isfinite(np.column_stack([v, i])).all():
         raise BenchTestError(f"{name}: samples or readings are missing; record again")
-    starts = np.flatnonzero(np.append(True, np.diff(recording.duty) != 0.0))
-    sizes = np.diff(np.append(starts, len(t)))
+    starts, sizes = holds(recording.duty)
     held = np.repeat(np.add.reduceat(v, starts) / sizes, sizes)  # the voltage over each hold, without its noise
     before = np.append(held[0], held[:-1])
     if np.ptp(np.add.reduceat(i, starts) / sizes) < SURE * float(np.std(np.diff(i))):
@@ -263,7 +263,6 @@ def steady(rows: Rows, resistance: Estimate) -> Found:
                         constant.scatter)
     if constant.value <= 0.0:
         raise BenchTestError(f"{rows.name}: R_a i_a exceeds v_a, so R_a = {resistance.value:g} Ω cannot be; check it")
-    per_rpm = 2.0 * math.pi / 60.0
     torque = constant.value * i
     load = mean_of(torque / w**2, "N·m·s²/rad²", "mean of K_t i_a/ω²",
                    constant.value * np.hypot(di, 2.0 * i / w * dw) / w**2)
@@ -278,8 +277,8 @@ def steady(rows: Rows, resistance: Estimate) -> Found:
             viscous = Estimate(float(b), float(sd[0]), "N·m·s/rad", "fit of K_t i_a = B_m ω + k_load ω²")
             load = Estimate(float(k), float(sd[1]), load.unit, viscous.how)
     numbers |= {"k_load": load, "B_m": viscous}
-    others = {"K_e in V/RPM": Estimate(constant.value * per_rpm, constant.sigma * per_rpm, "V/RPM", "K_e 2π/60",
-                                       constant.scatter * per_rpm)}
+    others = {"K_e in V/RPM": Estimate(constant.value * RPM, constant.sigma * RPM, "V/RPM", "K_e 2π/60",
+                                       constant.scatter * RPM)}
     return Found(rows.name, len(v), numbers, others, (), (
         Panel("back-EMF", "ω / rad/s", "v_a - R_a i_a / V", w, emf, lambda x: constant.value * x),
         Panel("load", "ω / rad/s", "K_t i_a / N·m", w, torque, lambda x: viscous.value * x + load.value * x * x)))
@@ -400,13 +399,12 @@ def plateaus(recording: Recording, channels: Sequence[str], name: str) -> Rows:
     missing = [c for c in channels if c not in recording.channels]
     if missing:
         raise BenchTestError(f"{name}: {', '.join(missing)} was not measured")
-    starts = np.flatnonzero(np.append(True, np.diff(recording.duty) != 0.0))
-    ends = np.append(starts[1:], len(recording))
+    starts, sizes = holds(recording.duty)
     resolution = {c: _step(getattr(recording, c)) / math.sqrt(12.0) for c in channels}
     rows: list[list[float]] = []
     sigmas: list[list[float]] = []
     unsettled = 0
-    for start, end in zip(starts.tolist(), ends.tolist()):
+    for start, end in zip(starts.tolist(), (starts + sizes).tolist()):
         if recording.t[end - 1] - recording.t[start] < HOLD:
             continue
         half = slice((start + end) // 2, end)
@@ -450,7 +448,3 @@ def _positive(rows: Rows, **columns: Array) -> None:
         if not (x > 0.0).all():
             at = int(np.flatnonzero(~(x > 0.0))[0])
             raise BenchTestError(f"{rows.name}: {name} = {x[at]:g} in row {at + 1}; leave out rows without a reading")
-
-
-__all__ = ["BenchTestError", "Estimate", "Found", "Panel", "RecordingError", "Rows", "blocked_recording",
-           "blocked_rotor", "current_step", "duty_map", "plateaus", "steady", "thrust_curve", "thrust_to_voltage"]

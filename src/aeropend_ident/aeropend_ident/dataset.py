@@ -19,7 +19,7 @@ from aeropend_ident.gap.chain import structure
 from aeropend_ident.gap.signals import CHANNELS, MINIMUM_DURATION, Signals, from_recording
 from aeropend_ident.gap.signals import from_arrays as signals_from_arrays
 from aeropend_ident.output_error import Means, Output
-from aeropend_ident.recording import Recording, RecordingError
+from aeropend_ident.recording import Recording, RecordingError, holds
 from aeropend_ident.terms import Array
 
 STATES = ("theta", "theta_dot", "i_a", "omega")
@@ -244,8 +244,7 @@ def _check_channel(read: Recording, name: str) -> None:
 
 def _held_voltage(v: Array, duty: Array, sigma: float, period: float) -> Array:
     """The voltage (N,) without its noise: its mean while the duty is held, and what varies slowly beside it."""
-    start = np.flatnonzero(np.append(True, np.diff(duty) != 0.0))
-    length = np.diff(np.append(start, len(v)))
+    start, length = holds(duty)
     mean = np.repeat(np.add.reduceat(v, start) / length, length)
     return np.asarray(mean + structure(v - mean, round(0.05 / period), sigma))
 

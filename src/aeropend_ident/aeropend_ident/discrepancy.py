@@ -28,3 +28,9 @@ def nominal(model: Model) -> dict[str, dict[str, float]]:
              "i_a": {"i_a": -winding, "omega": -c.K_e * c.per_L, "v_a": c.per_L},
              "omega": {"i_a": c.torque, "omega": -c.drag, speed: -c.load}}
     return {s: {t: x for t, x in terms.items() if x != 0.0} for s, terms in found.items()}
+
+
+def in_library(model: Model) -> dict[str, dict[str, float]]:
+    """`nominal` in terms of the thesis' library: the rotor never turns backwards, so ω|ω| is ω²."""
+    return {s: {t.replace("omega*abs(omega)", "omega*omega"): x for t, x in terms.items()}
+            for s, terms in nominal(model).items()}

@@ -19,7 +19,7 @@ import numpy as np
 
 from aeropend_ident import dataset, recording
 from aeropend_ident.dataset import Dataset
-from aeropend_ident.discrepancy import nominal
+from aeropend_ident.discrepancy import in_library
 from aeropend_ident.identify import Problem
 from aeropend_ident.output_error import Entries, Fitter
 from aeropend_ident.recording import RecordingError
@@ -86,9 +86,7 @@ def quality(model: Model, data: Dataset, show: Show = nothing) -> list[Excited]:
     Raises:
         RecordingError: the model does not run on it. ModelError: the model has effects.
     """
-    # the rotor never turns backwards, so ω|ω| is ω²
-    true = {s: {t.replace("omega*abs(omega)", "omega*omega"): c for t, c in e.items()}
-            for s, e in nominal(model).items()}
+    true = in_library(model)
     names = thesis_terms(data.variables)
     problem = Problem(data, names, None)
     matrix = np.zeros((len(data.states), len(names)))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from aeropend_ident.bag import Bag, RecordingError
 from aeropend_ident.cdr import Block, decode
 
-__all__ = ["CHANNELS", "Recording", "RecordingError", "Truth", "read", "split_topic"]
+__all__ = ["CHANNELS", "Recording", "RecordingError", "Truth", "holds", "read", "split_topic"]
 
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -161,6 +161,12 @@ def read(path: Path | str, namespace: str | None = None) -> Recording:
         return recording
     what = f"{bag.counts.total()} messages and {recording.duration:.3f} s of samples could be read"
     return replace(recording, notes=(*bag.problems, what, *recording.notes))
+
+
+def holds(duty: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Where in a duty (N,) each hold begins, and how many samples it lasts."""
+    start = np.flatnonzero(np.append(True, np.diff(duty) != 0.0))
+    return start, np.diff(np.append(start, len(duty)))
 
 
 def split_topic(topic: str, msgtype: str) -> tuple[str, str] | None:

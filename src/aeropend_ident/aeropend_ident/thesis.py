@@ -22,8 +22,9 @@ from aeropend_ident import bench_tests, dataset
 from aeropend_ident.bench_tests import GEAR, Estimate, Rows
 from aeropend_ident.dataset import STATES, Dataset, from_arrays
 from aeropend_ident.derivatives import tv_derivative
-from aeropend_ident.discrepancy import Equations, nominal
+from aeropend_ident.discrepancy import Equations, in_library, nominal
 from aeropend_ident.identify import Identified, identify
+from aeropend_ident.tables.units import RPM
 from aeropend_ident.terms import Array, Library, thesis_terms
 from aeropend_sim import actuator, dynamics, rig
 from aeropend_sim.command import Parser, interruptible
@@ -32,7 +33,6 @@ from aeropend_sim.parameters import SAMPLE_PERIOD, Model, load
 
 SECONDS = 70.0
 LIBRARY = Library.of((*STATES, "v_a"), thesis_terms((*STATES, "v_a")))
-RPM = 2.0 * math.pi / 60.0
 
 
 def _rows(name: str, names: Sequence[str], text: str) -> Rows:
@@ -91,12 +91,6 @@ DISCREPANCY = ("5.13", "5.14")
 """Figures of section 5.4. They print model less truth; what must be added to the model is the negative of that."""
 
 
-def truth(model: Model) -> dict[str, dict[str, float]]:
-    """The equations in terms of the library: the rotor never turns backwards, so ω|ω| is ω²."""
-    return {s: {t.replace("omega*abs(omega)", "omega*omega"): c for t, c in e.items()}
-            for s, e in nominal(model).items()}
-
-
 @cache
 def states(seed: int) -> tuple[Array, Array]:
     """States (N, 4) of `thesis` over 70 s, integrated in 32 steps a sample, and the voltage (N,)."""
@@ -110,7 +104,7 @@ def states(seed: int) -> tuple[Array, Array]:
 def rates(seed: int) -> Array:
     """The exact derivatives (N, 4) of `states`."""
     x, v = states(seed)
-    return LIBRARY(np.column_stack([x, v])) @ matrix_of(truth(load("thesis"))).T
+    return LIBRARY(np.column_stack([x, v])) @ matrix_of(in_library(load("thesis"))).T
 
 
 def noisy(seed: int, decibel: float) -> tuple[Array, Array]:
@@ -140,8 +134,8 @@ def mismatched() -> Model:
 
 def missing() -> dict[str, dict[str, float]]:
     """What that model lacks."""
-    wrong = truth(mismatched())
-    found = {s: {t: c - wrong[s].get(t, 0.0) for t, c in e.items()} for s, e in truth(load("thesis")).items()}
+    wrong = in_library(mismatched())
+    found = {s: {t: c - wrong[s].get(t, 0.0) for t, c in e.items()} for s, e in in_library(load("thesis")).items()}
     return {s: {t: c for t, c in e.items() if abs(c) > 1e-9} for s, e in found.items()}
 
 
@@ -153,7 +147,7 @@ def chapter_4() -> Iterator[tuple[str, str, str, str]]:
     printed, constant = found.others["K_e in V/RPM"], found.numbers["K_e"]
     yield "K_ω, Table 4.2", "6.606e-4, sd 1.377e-5", _one(printed), ""
     yield ("K_ω, Table 4.3", "6.6e-4 Vs/rad", _one(constant),
-           f"wrong unit: Table 4.2's speeds are RPM, so 6.6e-4 is V/RPM; in SI it is {60.0 / math.tau:.4g} times that")
+           f"wrong unit: Table 4.2's speeds are RPM, so 6.6e-4 is V/RPM; in SI it is {1.0 / RPM:.4g} times that")
     yield ("K_t, Table 4.3", "0.235 Nm/A", _one(found.numbers["K_t"]),
            "of the simulation model, not of this motor: in SI K_t is K_ω")
     yield ("B_m, Table 4.3", "0.01 Ns/m²", _one(found.numbers["B_m"]),
@@ -192,8 +186,8 @@ def as_printed(figure: str, optimiser: ModuleType, seed: int = 0) -> Array:
         figure: of `FIGURES`. optimiser: pysindy. seed: of the excitation and the noise.
     """
     x, v = states(seed)
-    exact = truth(load("thesis"))
-    known = matrix_of(truth(mismatched())) if figure in DISCREPANCY else np.zeros((len(STATES), len(LIBRARY)))
+    exact = in_library(load("thesis"))
+    known = matrix_of(in_library(mismatched())) if figure in DISCREPANCY else np.zeros((len(STATES), len(LIBRARY)))
     weak = figure in ("5.4", "5.9", "5.14")
     if figure in ("5.7", "5.9"):
         y, _ = noisy(seed, 50.0)
@@ -258,7 +252,7 @@ def chapter_5(figure: str, seed: int = 0) -> Iterator[str]:
             pysindy = None
         peer = None if pysindy is None else as_printed(figure, pysindy, seed)
     found = here(figure, seed)
-    true = missing() if figure in DISCREPANCY else truth(load("bench" if figure == "5.17" else "thesis"))
+    true = missing() if figure in DISCREPANCY else in_library(load("bench" if figure == "5.17" else "thesis"))
     yield f"Fig {figure}, {what}"
     yield f"  {'':24}{'true':>14}{'printed':>14}{'its way':>14}{'identify':>14}{'1 sigma':>10}"
     for s in STATES:
@@ -282,7 +276,7 @@ def chapter_5(figure: str, seed: int = 0) -> Iterator[str]:
 def _mse(matrix: Array, figure: str, seed: int) -> float:
     """Mean squared error of the arm's acceleration on the last quarter, from noise-free states."""
     x, v = states(seed)
-    whole = matrix + (matrix_of(truth(mismatched())) if figure in DISCREPANCY else 0.0)
+    whole = matrix + (matrix_of(in_library(mismatched())) if figure in DISCREPANCY else 0.0)
     late = slice(round(0.75 * len(x)), None)
     told = LIBRARY(np.column_stack([x, v])[late]) @ whole[1]
     return float(np.mean((told - rates(seed)[late, 1]) ** 2))
