@@ -13,6 +13,7 @@ message info, raw or not.
 """
 
 import difflib
+import gc
 import math
 import os
 import signal
@@ -388,6 +389,7 @@ def run(
     finally:
         stop.ignore()
         with _leaving(code):
+            gc.collect()  # what a node left behind that could not be made whole
             rclpy.try_shutdown()
     return code
 
