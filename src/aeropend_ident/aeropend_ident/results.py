@@ -68,7 +68,7 @@ def document(diagnosis: Diagnosis, bags: Sequence[str], model: str, seconds: flo
     if across:
         shrink = {**shrink, "across": list(across)}
     return {"format": FORMAT, "bags": list(bags), "model": model, "duration_s": round(duration, 3),
-            "samples": sum(len(s) for s in signals), "train_s": [0.0, round(train, 3)],
+            "samples": sum(s.samples for s in signals), "train_s": [0.0, round(train, 3)],
             "held_out_s": [round(train, 3), round(duration, 3)], **diagnosis.body, "shrink": shrink,
             "notes": [note for s in signals for note in s.notes], "seconds": round(seconds, 2)}
 

@@ -151,6 +151,14 @@ def test_lost_samples_do_not_make_true_periods_false():
     assert not find_pulses(read["omega"], SAMPLE_PERIOD, BENCH.sensing).false.any()
 
 
+def test_lost_samples_do_not_count():
+    data = columns()
+    for c in ("theta", "omega", "i_a", "v_a"):
+        data[c] = np.where(np.arange(len(data["duty"])) % 100 == 50, np.nan, data[c])
+    signals = from_arrays(data, SAMPLE_PERIOD, BENCH.sensing)
+    assert signals.samples == len(signals) - len(range(50, len(signals), 100))
+
+
 def test_noise_larger_than_the_model_says_is_seen():
     data = columns()
     data["i_a"] = data["i_a"] + 0.05 * np.random.default_rng(0).standard_normal(len(data["i_a"]))

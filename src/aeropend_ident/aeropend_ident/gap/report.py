@@ -317,7 +317,7 @@ def _ros(value: object) -> str:
 
 
 def _recordings(diagnosis: Diagnosis, doc: Any) -> list[dict[str, Any]]:
-    return [{"bag": str(bag), "notes": s.notes, "seconds": len(s) * s.period, "samples": len(s),
+    return [{"bag": str(bag), "notes": s.notes, "seconds": len(s) * s.period, "samples": s.samples,
              "train": s.train * s.period}
             for bag, s in zip(doc["bags"], diagnosis.signals, strict=False)]
 

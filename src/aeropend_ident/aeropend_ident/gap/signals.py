@@ -87,6 +87,11 @@ class Signals:
         return len(self.duty)
 
     @property
+    def samples(self) -> int:
+        """Instants of the grid at which something was measured."""
+        return int(np.isfinite([self.theta, self.omega, self.i_a, self.v_a]).any(axis=0).sum())
+
+    @property
     def after_unseen(self) -> int:
         """First sample whose voltage no duty from before the recording can have set, however late it acts."""
         return math.ceil(CATALOGUE["command_delay"].parameters["delay"].high / self.period) + 1
