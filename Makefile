@@ -36,8 +36,9 @@ test: .venv/.dev ## build and test with colcon in a temporary folder, then run e
 	$(BIN)/python -m pytest -n auto --dist loadscope -m "not live" $(ARGS) || [ $$? = 5 -a -n "$(ARGS)" ]
 	$(BIN)/python -m pytest -m live --reruns 1 -rR $(ARGS) || [ $$? = 5 -a -n "$(ARGS)" ]
 
-bench: .venv/.runtime ## measure speed beside C and scipy
+bench: .venv/.dev ## measure speed beside C, scipy, pysindy and rosbags (ARGS=--quick; ARGS=--readme writes the README's table)
 	tools/setup compiler
+	tools/setup firmware
 	$(BIN)/python test/bench.py $(ARGS)
 
 blind: .venv/.dev ## diagnose recordings of withheld effects, then open their labels (ARGS="--count 60 --seed 7")

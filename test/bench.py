@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure speed, each figure beside its peer in the same run: `make bench`, or `make bench ARGS=--quick`.
 
-Prints a table and writes it as JSON to bench-results/. Exit code 0 when every target is met, 1 when one is missed or
-could not be measured, 2 for a wrong command line.
+Prints a table and writes it as JSON to bench-results/. Ratios are compared with the last full run of the same machine.
+`--readme` measures nothing: it writes the table of the last full run into the README.
 """
 
 import argparse
@@ -17,18 +17,22 @@ from dataclasses import asdict
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from benchmarks import bags, control, hardware, identification, nodes, simulation
-from benchmarks.measure import Figure, NotMeasuredError, Spread, load
+from benchmarks import bags, control, growth, hardware, history, identification, nodes, readme, simulation
+from benchmarks.measure import Figure, NotMeasuredError, Spread, load, number
 from graph import isolate
 from rich.console import Console
 from rich.table import Table
 
 from aeropend_sim.command import Parser
 
-RESULTS = Path(__file__).resolve().parent.parent / "bench-results"
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "bench-results"
+LATEST = "latest.json"
+"""The last full run."""
 FIGURES: dict[str, Callable[[bool], list[Figure]]] = {
     "nominal": simulation.nominal,
     "effects": simulation.all_effects,
@@ -36,6 +40,10 @@ FIGURES: dict[str, Callable[[bool], list[Figure]]] = {
     "compile": simulation.compiling,
     "read": bags.reading,
     "diagnose": bags.diagnosing,
+    "diagnose-unknown": bags.unknown,
+    "growth-length": growth.length,
+    "growth-bags": growth.recordings,
+    "growth-effects": growth.effects,
     "sparse-exact": identification.exact,
     "sparse-noise": identification.noise,
     "sparse-rig": identification.chain,
@@ -43,16 +51,19 @@ FIGURES: dict[str, Callable[[bool], list[Figure]]] = {
     "sparse-speed": identification.speed,
     "plant": nodes.plant,
     "record": nodes.record,
+    "emulator": hardware.emulator,
     "bridge": hardware.bridge,
     "frames": hardware.frames,
     "control": control.loop,
 }
-PACKAGES = ("numpy", "numba", "llvmlite", "scipy", "rosbags", "ros-jazzy-rclpy")
+PACKAGES = ("numpy", "numba", "llvmlite", "scipy", "rosbags", "pysindy", "ros-jazzy-rclpy")
 EXAMPLES = """examples:
   make bench ARGS=--quick
   make bench ARGS="--only plant record"
+  make bench ARGS=--readme             the table of the last full run goes into README.md
 
-exit codes: 0 every target is met, 1 one is missed or could not be measured, 2 a wrong command line, 130 interrupted"""
+exit codes: 0 every target is met, 1 one is missed or could not be measured, 2 a wrong command line, or no results for
+the README, 3 every target is met but a ratio is over 20 % worse than in the last full run, 130 interrupted"""
 
 QUIET = 0.5
 """Load average below which the machine counts as idle."""
@@ -81,12 +92,6 @@ def machine() -> dict[str, object]:
             "gcc": first_line("gcc", "--version"), "commit": first_line("git", "describe", "--always", "--dirty")}
 
 
-def number(value: float, unit: str) -> str:
-    """A number and its unit, short."""
-    text = f"{value:,.0f}" if abs(value) >= 1000.0 or value == 0.0 else f"{value:.3g}"
-    return f"{text} {unit}".rstrip(" -")
-
-
 def cell(spread: Spread | None, unit: str) -> str:
     """Median and quartiles."""
     if spread is None:
@@ -107,25 +112,34 @@ def table(figures: list[Figure]) -> Table:
 
 
 def write(document: dict[str, object], folder: Path) -> Path:
-    """Write the results twice, under their date and as latest.json; returns the former."""
+    """Write the results under their date, those of a full run as latest.json too; returns the former."""
     folder.mkdir(exist_ok=True)
     (folder / ".gitignore").write_text("*\n", encoding="utf-8")
     path = folder / f"{datetime.now().astimezone():%Y-%m-%d-%H-%M-%S}.json"
-    for one in path, folder / "latest.json":
+    for one in (path, folder / LATEST) if document["full"] else (path,):
         one.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return path
 
 
-def main() -> int:
-    """Measure what the command line asks for."""
-    parser = Parser(prog="bench", description=(__doc__ or "").partition("\n")[0], epilog=EXAMPLES,
-                    formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="shorter and with fewer repeats: 3 minutes, not 25")
-    parser.add_argument("--only", nargs="+", choices=FIGURES, metavar="FIGURE", default=list(FIGURES),
-                        help=f"measure only these: {', '.join(FIGURES)}")
-    options = parser.parse_args()
-    console = Console(width=None if sys.stdout.isatty() else 160)
-    isolate()
+def show(file: Path, results: Path) -> None:
+    """Write the table of the last full run into a README.
+
+    Raises:
+        ValueError: there is no such run, or no place for the table; one line.
+    """
+    document = history.read(results / LATEST)
+    if document is None:
+        raise ValueError(f"{results / LATEST} holds no results: run make bench, without ARGS, first")
+    try:
+        file.write_text(readme.put(file.read_text(encoding="utf-8"), readme.table(document)), encoding="utf-8")
+    except OSError as error:
+        raise ValueError(f"{file}: {error.strerror}") from None
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+
+
+def measured(names: list[str], quick: bool, console: Console) -> dict[str, object]:
+    """Measure, show, and return what is to be written."""
     figures: list[Figure] = []
     missing: list[str] = []
     start, load_before = time.monotonic(), load()
@@ -133,31 +147,60 @@ def main() -> int:
         console.print(f"The machine is busy (load {load_before:.1f}): what runs in several processes or threads will "
                       "look slower than it is.")
     with console.status("") as status:
-        for name in options.only:
+        for name in names:
             status.update(f"measuring {name}")
             console.print(f"[dim]{time.monotonic() - start:4.0f} s  {name} ...")
             try:
-                figures += FIGURES[name](options.quick)
+                figures += FIGURES[name](quick)
             except NotMeasuredError as error:
                 missing.append(f"{name}: not measured: {error}")
                 console.print(missing[-1], style="yellow", markup=False)
-    missed = [one.name for one in figures if one.met is False]
-    document = {
-        "format": 1, "date": datetime.now(timezone.utc).isoformat(timespec="seconds"), "quick": options.quick,
-        "seconds": round(time.monotonic() - start, 1), "machine": machine(), "load_before": load_before,
-        "figures": [{**asdict(one), "target": one.target and str(one.target), "met": one.met} for one in figures],
-        "not_measured": missing, "missed": missed,
-    }
-    path = write(document, RESULTS)
     if figures:
         console.print(table(figures))
-    console.print(f"Median \\[quartiles]; ratio of times, ours over peer. Written to {path} and latest.json beside it.")
+    return {
+        "format": 1, "date": datetime.now(timezone.utc).isoformat(timespec="seconds"), "quick": quick,
+        "full": not quick and set(names) == set(FIGURES), "seconds": round(time.monotonic() - start, 1),
+        "machine": machine(), "load_before": load_before,
+        "figures": [{**asdict(one), "target": one.target and str(one.target), "met": one.met} for one in figures],
+        "not_measured": missing, "missed": [one.name for one in figures if one.met is False],
+    }
+
+
+def main(arguments: list[str] | None = None, results: Path = RESULTS) -> int:
+    """Measure what the command line asks for."""
+    parser = Parser(prog="bench", description=(__doc__ or "").partition("\n")[0], epilog=EXAMPLES,
+                    formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="shorter and with fewer repeats: 6 minutes, not 35")
+    parser.add_argument("--only", nargs="+", choices=FIGURES, metavar="FIGURE", default=list(FIGURES),
+                        help=f"measure only these: {', '.join(FIGURES)}")
+    parser.add_argument("--readme", nargs="?", type=Path, const=ROOT / "README.md", metavar="FILE",
+                        help="measure nothing, write the table of the last full run into FILE (default: README.md)")
+    options = parser.parse_args(arguments)
+    if options.readme is not None:
+        try:
+            show(options.readme, results)
+        except ValueError as error:
+            parser.error(str(error))
+        return 0
+    console = Console(width=None if sys.stdout.isatty() else 160)
+    isolate()
+    document: dict[str, Any] = measured(options.only, options.quick, console)
+    then = history.before(results, document["machine"])
+    worse = history.worse(document, then) if then else []
+    path = write({**document, "compared_with": then and then["date"], "worse": worse}, results)
+    console.print(f"Median \\[quartiles]; ratio: ours over peer. Written to {path}"
+                  + (f" and {LATEST} beside it." if document["full"] else "."))
+    if then and worse:
+        console.print(f"[yellow]{len(worse)} ratios are over {100 * history.WORSE:.0f} % worse than on {then['date']}:")
+        console.print("\n".join(f"  {line}" for line in worse), f"\n  meanwhile: {history.changed(document, then)}",
+                      markup=False, sep="")
+    missed, missing = document["missed"], document["not_measured"]
     if missed:
-        console.print(f"[red]{len(missed)} of {sum(one.met is not None for one in figures)} targets missed: "
-                      + "; ".join(missed))
+        console.print(f"[red]{len(missed)} of {sum(one['met'] is not None for one in document['figures'])} targets "
+                      "missed: " + "; ".join(missed))
     if missing:
         console.print(f"[yellow]{len(missing)} could not be measured: see above")
-    return 1 if missed or missing else 0
+    return 1 if missed or missing else 3 if worse else 0
 
 
 if __name__ == "__main__":

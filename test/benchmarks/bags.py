@@ -3,24 +3,25 @@
 
 import json
 import math
-import os
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from blind.bags import write
+from blind.peers import sparse_regression, stepwise_bic
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from aeropend_ident import recording
+from aeropend_ident.usable import signals_of
 from aeropend_sim import interface
 from aeropend_sim.effects import CATALOGUE
 from aeropend_sim.excitation import Excitation
-from aeropend_sim.parameters import load
+from aeropend_sim.parameters import Model, load
 from aeropend_sim.rig import record
 from benchmarks import measure
 from benchmarks.measure import Figure, NotMeasuredError, Spread, Target, interleaved
@@ -28,17 +29,69 @@ from benchmarks.nodes import PERIOD_NS
 
 SECONDS = 70.0
 EFFECT = "coulomb_friction"
+SPARSE, STEPWISE = "sparse regression of the discrepancy", "stepwise BIC on the output error"
+LIMIT_S = 420.0
+"""What takes longer counts as never done."""
 START_NS = 1_700_000_000_000_000_000
 TYPES = {interface.JOINT_STATES: "sensor_msgs/msg/JointState", interface.ARMATURE: "sensor_msgs/msg/BatteryState",
          interface.DUTY_COMMAND: "std_msgs/msg/Float64"}
 
 
+# ru_maxrss of a child begins with what its parent has, so the parent is a small one.
+START = """
+import json, resource, subprocess, sys, time
+start = time.perf_counter()
+try:
+    done = subprocess.run(sys.argv[2:], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=float(sys.argv[1]))
+    code, said = done.returncode, done.stdout.decode()
+except subprocess.TimeoutExpired:
+    code, said = None, "not done in time"
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+seconds = time.perf_counter() - start
+print(json.dumps([code, said, seconds, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024]))
+"""
+
+
+class Run(NamedTuple):
+    """What a process took: s by the clock, s CPU, bytes of memory at its peak; inf where it was not done in time."""
+
+    seconds: float
+    cpu: float
+    peak: float
+
+
+def diagnosed(*args: str | Path, code: int = 0, limit: float = LIMIT_S) -> Run:
+    """Run `diagnose` as it is installed.
+
+    Args:
+        args: of its command line. code: the exit code expected. limit: s it may take.
+
+    Raises:
+        NotMeasuredError: it is not installed, or ended otherwise.
+    """
+    command = Path(sys.executable).parent / "diagnose"
+    if not command.exists():
+        raise NotMeasuredError(f"there is no {command}: run make demo or make test once")
+    done = subprocess.run([sys.executable, "-c", START, str(limit), str(command), *map(str, args)],
+                          capture_output=True, text=True, check=True)
+    ended, said, seconds, cpu, peak = json.loads(done.stdout)
+    if ended is None:
+        return Run(math.inf, math.inf, math.inf)
+    if ended != code:
+        raise NotMeasuredError(f"diagnose ended with {ended}: {' '.join(said.split())[-300:]}")
+    return Run(seconds, cpu, peak)
+
+
+def rig_with(*effects: str) -> Model:
+    """`bench` with effects at their default sizes."""
+    return load("bench").with_effects({id_: {name: p.default for name, p in CATALOGUE[id_].parameters.items()}
+                                       for id_ in effects})
+
+
 def make(path: Path) -> Path:
     """Write the bag that `record` would have written of a simulated rig with one effect."""
-    model = load("bench")
-    model = model.with_effects({EFFECT: {name: p.default for name, p in CATALOGUE[EFFECT].parameters.items()}})
     duty = Excitation(duration=SECONDS).series().astype(np.float32).astype(float)
-    rig, _ = record(model, duty)
+    rig, _ = record(rig_with(EFFECT), duty)
     store, nan, none = get_typestore(Stores.ROS2_JAZZY), math.nan, np.array([])
     joint, battery, float64 = (store.types[TYPES[topic]] for topic in TYPES)
 
@@ -95,33 +148,45 @@ def reading(quick: bool) -> list[Figure]:
         ours_s, peer_s = interleaved(3 if quick else 9, lambda: recording.read(bag), lambda: decode(bag))
     return [Figure("reading a 70 s bag into arrays", "s CPU", Spread.of(ours_s), Target(0.2),
                    "rosbags AnyReader.deserialize", Spread.of(peer_s), Spread.of(ours_s / peer_s),
-                   {"messages": sum(map(len, peer.values()))}, load=about)]
+                   {"messages": sum(map(len, peer.values()))}, load=about, main=True)]
 
 
 def diagnosing(quick: bool) -> list[Figure]:
-    """`diagnose` on a 70 s recording: time and peak memory. No other program does this."""
-    command = Path(sys.executable).parent / "diagnose"
-    if not command.exists():
-        raise NotMeasuredError(f"there is no {command}: run make demo or make test once")
+    """`diagnose` on a 70 s recording: time and peak memory, beside two ways to choose among the same effects."""
     about = measure.load()
-    seconds, memory = [], []
     with tempfile.TemporaryDirectory(prefix="aeropend_bench_") as folder:
         bag = make(Path(folder) / "bag")
-        for k in range(1 if quick else 3):
-            out = Path(folder) / f"out{k}"
-            with (Path(folder) / "output").open("w+") as output:
-                start = time.perf_counter()
-                process = subprocess.Popen([str(command), str(bag), "--out", str(out)], stdout=output, stderr=output)
-                _, status, usage = os.wait4(process.pid, 0)
-                process.returncode = os.waitstatus_to_exitcode(status)
-                seconds.append(time.perf_counter() - start)
-                output.seek(0)
-                if process.returncode:
-                    said = " ".join(output.read().split())[-300:]
-                    raise NotMeasuredError(f"diagnose ended with {process.returncode}: {said}")
-            memory.append(usage.ru_maxrss / 1024.0)
-        found = json.loads((out / "diagnosis.json").read_text(encoding="utf-8"))
-    note = f"verdict {found['which']['verdict']} for {EFFECT}, {found['seconds']} s of it the diagnosis itself"
-    return [Figure("diagnose on a 70 s recording", "s", Spread.of(seconds), details={"verdict": found["which"]},
-                   note=note, load=about),
-            Figure("diagnose: peak memory", "MiB", Spread.of(memory), load=about)]
+        outs = [Path(folder) / f"out{k}" for k in range(1 if quick else 3)]
+        runs = [diagnosed(bag, "--out", out) for out in outs]
+        found = json.loads((outs[-1] / "diagnosis.json").read_text(encoding="utf-8"))
+        model = load("bench")
+        signals = signals_of(bag, None, model.sensing)
+        peers = {SPARSE: sparse_regression(signals, model), STEPWISE: stepwise_bic(signals, model)}
+    seconds = np.array([one.seconds for one in runs])
+    of_peer = Spread.of(peers[STEPWISE]["seconds"])
+    said = {"diagnose": found["which"], **peers}
+    note = f"{EFFECT}: " + ", ".join(f"{name} says {' + '.join(x['effects']) or 'none'}" for name, x in said.items())
+    note += f"; {found['seconds']} s of it the diagnosis itself, the regression {peers[SPARSE]['seconds']:.1f} s"
+    return [Figure("diagnose on a 70 s recording", "s", Spread.of(seconds), Target(10.0),
+                   STEPWISE, of_peer, Spread.of(seconds / of_peer.median),
+                   {"verdict": found["which"], "peers": peers}, note, about, main=True),
+            Figure("diagnose on a 70 s recording: peak memory", "MB", Spread.of([one.peak / 1e6 for one in runs]),
+                   load=about)]
+
+
+def unknown(quick: bool) -> list[Figure]:
+    """`diagnose --fit-nominal` on angle and command alone: 60 s at 98 Hz and 1024 steps a turn."""
+    about = measure.load()
+    duty = Excitation(duration=60.0).series().astype(np.float32).astype(float)[::5]
+    duty = np.repeat(duty, 5)
+    rig, _ = record(rig_with("cable_torque"), duty)
+    nothing = np.full(len(duty[::5]), math.nan)
+    columns = {"theta": rig["theta"][::5], "omega": nothing, "i_a": nothing, "v_a": nothing, "duty": duty[::5]}
+    with tempfile.TemporaryDirectory(prefix="aeropend_bench_") as folder:
+        bag = Path(folder) / "bag"
+        write(bag, columns, 5 * PERIOD_NS)
+        runs = [diagnosed(bag, "--fit-nominal", "--out", Path(folder) / f"out{k}") for k in range(1 if quick else 3)]
+        found = json.loads((Path(folder) / "out0" / "diagnosis.json").read_text(encoding="utf-8"))
+    return [Figure("diagnose --fit-nominal, 60 s of angle and command", "s", Spread.of([one.seconds for one in runs]),
+                   Target(20.0), details={"verdict": found["which"]},
+                   note=f"verdict {found['which']['verdict']} for cable_torque", load=about, main=True)]

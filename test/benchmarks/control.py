@@ -135,7 +135,7 @@ def loop(quick: bool) -> list[Figure]:
     def figure(name: str, unit: str, key: str, target: Target | None, note: str = "") -> Figure:
         return Figure(f"{LONGEST}, {seconds:.0f} s: {name}", unit, Spread.of(ours[key]), target,
                       f"the law in a plain rclpy node, {min(seconds, 60.0):.0f} s", Spread.of(peer[key]), None, details,
-                      note, about)
+                      note, about, main=target is not None)
 
     return [
         figure("samples missed or without a command", f"of {ours['samples']:.0f}", "missed", Target(0.0)),

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bridge with the emulated board through a pty, and what errors on the wire get past the frames."""
 
+import math
 import random
 import struct
+import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
 from itertools import combinations
 from pathlib import Path
 
+import boards
 import numpy as np
 from cobs import cobs
 from diagnostic_msgs.msg import DiagnosticArray
@@ -20,7 +23,7 @@ from swap import NoBoardError, emulated_board
 from aeropend_bridge import protocol
 from aeropend_sim import interface
 from benchmarks import measure
-from benchmarks.measure import Figure, NotMeasuredError, Spread, Target
+from benchmarks.measure import Figure, NotMeasuredError, Spread, Target, interleaved
 from benchmarks.nodes import NAMESPACE, SETTLE_S, Listener, Process, Stamps
 
 RATE_HZ = 16e6 / (64 * 510)
@@ -117,9 +120,9 @@ def bridge(quick: bool) -> list[Figure]:
                "worst_error_us": float(np.abs(error_us).max()), "commands": len(sent), "unanswered": unanswered,
                "rate_hz": (len(stamps) - 1) / (1e-9 * float(stamps[-1] - stamps[0])), "counters": counters}
 
-    def figure(name: str, unit: str, value: float, limit: float | None, note: str = "") -> Figure:
-        return Figure(f"bridge, {seconds:.0f} s: {name}", unit, Spread.of(value),
-                      None if limit is None else Target(limit), details=details, note=note, load=about)
+    def figure(name: str, unit: str, value: float, limit: float, note: str = "") -> Figure:
+        return Figure(f"bridge, {seconds:.0f} s: {name}", unit, Spread.of(value), Target(limit), details=details,
+                      note=note, load=about, main=not name.startswith("frames"))
 
     return [
         figure("samples lost or late to the listener", f"of {len(stamps) + missing}", missing, 0.0,
@@ -132,6 +135,46 @@ def bridge(quick: bool) -> list[Figure]:
                f"{unanswered} of {len(sent)} commands never showed in the register by themselves"),
         figure("CPU of a core", "%", 100.0 * cpu / wall, 30.0),
     ]
+
+
+def emulator(quick: bool) -> list[Figure]:
+    """The emulated board in simulated time: its speed, what interrupts take with SSI, and how speeds are timed."""
+    about = measure.load()
+    try:
+        boards.build()
+    except (OSError, subprocess.CalledProcessError):
+        said = "the board's program was not built: tools/setup firmware installs what it needs"
+        raise NotMeasuredError(said) from None
+    program = boards.FIRMWARE / "build" / "aeropend.elf"
+    periods, captures = 500, 6_000 if quick else 100_000
+    board, bench = boards.Board(boards.quiet()), boards.Bench(program)
+
+    def with_plant() -> None:
+        for _ in range(periods):
+            board.step()
+
+    real = periods * boards.PERIOD_CYCLES / 16e6
+    ours, peer = (real / s for s in interleaved(3 if quick else 15, with_plant,
+                                                lambda: [bench.run() for _ in range(periods)]))
+    bench = boards.Bench(program)
+    bench.answer(boards.SCHEME, "B", 1)
+    bench.enable()
+    for k in range(periods):
+        bench.host.duty(0.5)
+        bench.run(1, [163 * k % boards.PERIOD_CYCLES])
+    load = bench.chip.load
+    try:
+        checked, near = boards.check_speed(program, captures)
+        wrong, note = 0.0, f"{near} of {checked} steered to within 45 µs of a timer overflow"
+    except AssertionError as error:
+        checked, wrong, note = captures, math.inf, str(error).partition("\n")[0]
+    return [Figure("emulated board with plant", "x real time", Spread.of(ours), Target(15.0, at_least=True),
+                   "simavr, the processor alone", Spread.of(peer), Spread.of(ours / peer), load=about, main=True),
+            Figure("interrupts of the board with SSI, a command and a pulse each period", "% of the time",
+                   Spread.of(100.0 * load.cycles / bench.chip.cycle), Target(40.0),
+                   note=f"the longest {load.longest / 16.0:.1f} µs, stack {load.stack} bytes", load=about, main=True),
+            Figure("speeds timed wrong by more than a tick", f"of {checked:,}", Spread.of(wrong), Target(0.0),
+                   note=note, load=about)]
 
 
 def _sample(rng: random.Random) -> bytes:

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from aeropend_ident import dataset, lorenz
 from aeropend_ident.dataset import STATES
 from aeropend_ident.derivatives import tv_derivative
-from aeropend_ident.discrepancy import nominal
+from aeropend_ident.discrepancy import in_library, nominal
 from aeropend_ident.identify import Identified, identify
 from aeropend_ident.output_error import Entries, Experiment, Fitter, Output
 from aeropend_ident.recording import RecordingError
 from aeropend_ident.sindy import regress
-from aeropend_ident.thesis import LIBRARY, SECONDS, given, mismatched, missing, noisy, rates, states, truth
+from aeropend_ident.thesis import LIBRARY, SECONDS, given, mismatched, missing, noisy, rates, states
 from aeropend_ident.weak import Weak
 from aeropend_sim import rig
 from aeropend_sim.excitation import Excitation
@@ -35,7 +35,7 @@ SEEDS, QUICK = 20, 3
 def limits(seed: int, sigma: Array) -> dict[tuple[str, str], float]:
     """Cramér-Rao 1 sigma of every true coefficient, from all 70 s."""
     x, v = states(seed)
-    true = truth(load("thesis"))
+    true = in_library(load("thesis"))
     matrix = np.array([[true[s].get(t, 0.0) for t in LIBRARY.names] for s in STATES])
     outputs = tuple(Output(s, k, x[:, k], float(sigma[k])) for k, s in enumerate(STATES))
     fitter = Fitter(Experiment(LIBRARY, v[:, None].copy(), SAMPLE_PERIOD, x, outputs, free_states=4),
@@ -58,7 +58,7 @@ def errors(found: Identified, true: dict[str, dict[str, float]]) -> float:
 def exact(quick: bool) -> list[Figure]:
     """Noise-free data of `thesis`: terms and coefficients by every method (thesis 5.2 and 5.4)."""
     about = measure.load()
-    true, absent, known = truth(load("thesis")), missing(), nominal(mismatched())
+    true, absent, known = in_library(load("thesis")), missing(), nominal(mismatched())
     figures = []
     for method, target in (("sindy", 1e-8), ("weak", 1e-4), ("discrepancy-sindy", 1e-3), ("discrepancy-weak", 1e-3)):
         off = []
@@ -74,7 +74,7 @@ def exact(quick: bool) -> list[Figure]:
 def noise(quick: bool) -> list[Figure]:
     """The thesis' noisy setting: 70 s of `thesis`, 50 dB; then 40 and 30 dB."""
     figures = []
-    true = truth(load("thesis"))
+    true = in_library(load("thesis"))
     for decibel in (50.0, 40.0, 30.0):
         about = measure.load()
         right, ratios, thrust, seconds = [], [], [], []
@@ -98,9 +98,9 @@ def noise(quick: bool) -> list[Figure]:
         figures += [
             Figure(f"{name}: seeds with exactly the true terms", "-", Spread.of(float(np.mean(right))),
                    Target(0.95, at_least=True) if aim else None, details={"wrong": lost, "seconds": seconds},
-                   note="; ".join(f"{k} {n} times" for k, n in lost.items()), load=about),
+                   note="; ".join(f"{k} {n} times" for k, n in lost.items()), load=about, main=aim),
             Figure(f"{name}: error over the Cramér-Rao 1 sigma, 95 % quantile", "-",
-                   Spread.of(float(np.quantile(ratios, 0.95))), Target(3.0) if aim else None, load=about),
+                   Spread.of(float(np.quantile(ratios, 0.95))), Target(3.0) if aim else None, load=about, main=aim),
             Figure(f"{name}: K_q, largest relative error", "-", Spread.of(max(thrust)), Target(0.01) if aim else None,
                    load=about)]
     return figures
@@ -110,7 +110,7 @@ def chain(quick: bool) -> list[Figure]:
     """Recordings of `bench` through its measurement chain: terms of θ̈, and free runs on held-out data."""
     about = measure.load()
     model = load("bench")
-    true = truth(model)
+    true = in_library(model)
     arm, every, worst, seconds = [], [], [], []
     for seed in range(QUICK if quick else SEEDS):
         duty = Excitation(duration=SECONDS, seed=seed).series()
@@ -141,7 +141,7 @@ def study(quick: bool) -> list[Figure]:
     peer = [float(lorenz.is_exact(_pysindy_lorenz(seed), true)) for seed in seeds]
     return [Figure("Lorenz, 5 % noise: runs with exactly the true terms", "-", Spread.of(float(np.mean(ours))),
                    Target(0.9, at_least=True), "pysindy weak form, STLSQ 0.5", Spread.of(float(np.mean(peer))),
-                   load=about)]
+                   load=about, main=True)]
 
 
 def _pysindy() -> Any:
@@ -203,7 +203,8 @@ def speed(quick: bool) -> list[Figure]:
     if done.returncode:
         raise NotMeasuredError(f"the memory of identify: {done.stderr.strip().splitlines()[-1]}")
     return [Figure("weak form with selection, 34,313 samples x 31 terms", "s CPU", Spread.of(mine), Target(2.0),
-                   "pysindy weak form (K 1000), STLSQ", Spread.of(theirs), Spread.of(mine / theirs), load=about),
+                   "pysindy weak form (K 1000), STLSQ", Spread.of(theirs), Spread.of(mine / theirs), load=about,
+                   main=True),
             Figure("TVRegDiff, 34,313 samples, strength chosen", "s CPU", Spread.of(tv), Target(1.0), load=about),
             Figure("identify weak, 34,313 x 31, refinement included: peak memory", "MiB",
                    Spread.of(float(done.stdout)), Target(500.0), load=about)]

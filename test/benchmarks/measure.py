@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """How the benchmark measures, and what a figure is."""
 
+import math
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -29,7 +30,9 @@ class Spread:
     def of(cls, values: Sequence[float] | np.ndarray | float) -> "Spread":
         """Sum up values; a single number is a measurement made once."""
         values = np.atleast_1d(np.asarray(values, dtype=float))
-        low, q1, median, q3, high = np.percentile(values, (0, 25, 50, 75, 100)).tolist()
+        with np.errstate(invalid="ignore"):  # between two infinite ones, or one and a number, is infinity
+            found = np.percentile(values, (0, 25, 50, 75, 100))
+        low, q1, median, q3, high = np.where(np.isnan(found) & ~np.isnan(values).any(), np.inf, found).tolist()
         return cls(median, q1, q3, low, high, len(values))
 
 
@@ -57,10 +60,11 @@ class Figure:
         target: what it must reach, if that is agreed.
         peer_name: whom it is compared with.
         peer: the peer, in the same run.
-        ratio: ours over peer, pair by pair.
+        ratio: ours over peer, pair by pair; of medians where nothing else is given.
         details: further numbers for the JSON file.
         note: one line below the table.
         load: processes that wanted a core when the measurement began (1-minute average).
+        main: whether it is in the README's table.
     """
 
     name: str
@@ -73,6 +77,11 @@ class Figure:
     details: dict[str, Any] = field(default_factory=dict)
     note: str = ""
     load: float = 0.0
+    main: bool = False
+
+    def __post_init__(self) -> None:
+        if self.ratio is None and self.peer is not None and self.peer.median > 0.0:
+            self.ratio = Spread.of(self.ours.median / self.peer.median)
 
     @property
     def met(self) -> bool | None:
@@ -101,6 +110,12 @@ def interleaved(repeats: int, *functions: Callable[[], Any], clock: Callable[[],
             function()
             seconds[j, k] = clock() - start
     return list(seconds)
+
+
+def number(value: float, unit: str) -> str:
+    """A number and its unit, short."""
+    text = f"{value:,.0f}" if 1000.0 <= abs(value) < math.inf or value == 0.0 else f"{value:.3g}"
+    return f"{text} {unit}".rstrip(" -")
 
 
 def load() -> float:

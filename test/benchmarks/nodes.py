@@ -133,7 +133,7 @@ def plant(quick: bool) -> list[Figure]:
 
     def figure(name: str, unit: str, key: str, limit: float, note: str = "") -> Figure:
         return Figure(f"plant, {seconds:.0f} s: {name}", unit, Spread.of(ours[key]), Target(limit), "rclpy timer node",
-                      Spread.of(peer[key]), None, details, note, about)
+                      Spread.of(peer[key]), None, details, note, about, main=True)
 
     for one in ours, peer:
         one["missed_or_late"] = one["missed"] + one["late"]
@@ -218,7 +218,7 @@ def record(quick: bool) -> list[Figure]:
                f"rclpy + rosbags Writer, {min(seconds, 60.0):.0f} s",
                Spread.of(peer["lost"] + peer["without_armature"] + peer["without_angle"]), None, details,
                f"plant counted {ours['plant_published']:.0f}, recorded meanwhile {ours['recorded_meanwhile']:.0f}",
-               about),
+               about, main=True),
         Figure("record: CPU of a core", "%", Spread.of(ours["cpu_percent"]), None, "rclpy + rosbags Writer",
-               Spread.of(peer["cpu_percent"]), None, load=about),
+               Spread.of(peer["cpu_percent"]), None, load=about, main=True),
     ]

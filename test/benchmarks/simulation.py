@@ -142,7 +142,7 @@ def nominal(quick: bool) -> list[Figure]:
                Spread.of(1e3 * c_s), Spread.of(ours_s / c_s),
                {"samples": len(series), "c_o3_without_native_ms": 1e3 * Spread.of(plain_s).median,
                 "c_as_accurate": {"steps_a_sample": inner, "ms": as_good_ms}},
-               f"C needs {inner} steps a sample and {as_good_ms:.2f} ms to be as accurate", about),
+               f"C needs {inner} steps a sample and {as_good_ms:.2f} ms to be as accurate", about, main=True),
         Figure("nominal model, worst error of any state over its range", "-", Spread.of(max(ours_error.values())),
                Target(2e-5), "C RK4, 1 step a sample", Spread.of(errors[1]),
                Spread.of(max(ours_error.values()) / errors[1]),
@@ -161,7 +161,7 @@ def all_effects(quick: bool) -> list[Figure]:
     c = c_series(model, "-march=native")
     ours_s, c_s = interleaved(20 if quick else 150, lambda: dynamics.simulate(full, series, noise=noise), c)
     return [Figure(f"all {len(CATALOGUE)} effects on, 70 s", "ms CPU", Spread.of(1e3 * ours_s), Target(3.9, "ratio"),
-                   "C RK4 without effects", Spread.of(1e3 * c_s), Spread.of(ours_s / c_s), load=about)]
+                   "C RK4 without effects", Spread.of(1e3 * c_s), Spread.of(ours_s / c_s), load=about, main=True)]
 
 
 def batch(quick: bool) -> list[Figure]:
@@ -190,7 +190,7 @@ def batch(quick: bool) -> list[Figure]:
     ours_s, c_s = interleaved(5 if quick else 25, ours, c, clock=time.perf_counter)
     return [Figure(f"{MODELS} parameter sets, error sums, {THREADS} threads", "runs/s", Spread.of(MODELS / ours_s),
                    Target(4000.0, at_least=True), "C RK4, 16 SIMD lanes, OpenMP", Spread.of(MODELS / c_s),
-                   Spread.of(c_s / ours_s), {"gcc_flags": ["-O3", *flags]}, load=about)]
+                   Spread.of(c_s / ours_s), {"gcc_flags": ["-O3", *flags]}, load=about, main=True)]
 
 
 COMPILE = """

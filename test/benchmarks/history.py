@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Results of earlier runs: which one to compare with, which ratios got worse since then, and what else changed."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+WORSE = 0.2
+"""Share by which a ratio must be worse to be told; its quartiles must not touch those of before, either."""
+
+Document = Mapping[str, Any]
+"""What a run wrote."""
+
+
+def read(path: Path) -> Document | None:
+    """A run's results; None where the file holds no such thing."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return document if isinstance(document, dict) and document.get("format") == 1 else None
+
+
+def before(folder: Path, machine: Mapping[str, object]) -> Document | None:
+    """The latest full run on the same processor with the same Python; None: there is none."""
+    for path in sorted(folder.glob("[0-9]*.json"), reverse=True):
+        document = read(path)
+        if document and document.get("full") and all(document["machine"][k] == machine[k] for k in ("cpu", "python")):
+            return document
+    return None
+
+
+def worse(now: Document, then: Document) -> list[str]:
+    """The ratios that got worse, a line each."""
+    old = {one["name"]: one for one in then["figures"]}
+    lines = []
+    for one in now["figures"]:
+        a, b = one["ratio"], old.get(one["name"], {}).get("ratio")
+        if not a or not b or one["peer_name"] != old[one["name"]]["peer_name"]:
+            continue
+        if (one["target"] or "").startswith("≥"):
+            bad = a["median"] < b["median"] / (1.0 + WORSE) and a["q3"] < b["q1"]
+        else:
+            bad = a["median"] > b["median"] * (1.0 + WORSE) and a["q1"] > b["q3"]
+        if bad:
+            lines.append(f"{one['name']}: {a['median']:.3g} of {one['peer_name']}, was {b['median']:.3g} "
+                         f"(load {one['load']:.1f}, was {old[one['name']]['load']:.1f})")
+    return lines
+
+
+def changed(now: Document, then: Document) -> str:
+    """What else is not as it was: versions, commit, load."""
+    a, b = now["machine"], then["machine"]
+    rows = [(k, b.get(k, "none"), a.get(k, "none")) for k in dict.fromkeys([*b, *a]) if b.get(k) != a.get(k)]
+    rows.append(("load", f"{then['load_before']:.1f}", f"{now['load_before']:.1f}"))
+    return ", ".join(f"{name} {x} -> {y}" for name, x, y in rows)

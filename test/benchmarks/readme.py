@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The README's table of figures, from the results of a run."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from benchmarks.measure import number
+
+BEGIN, END = "<!-- make bench: begin -->", "<!-- make bench: end -->"
+"""Between these two lines of the README is the table."""
+
+
+def _cell(spread: Mapping[str, float] | None, unit: str) -> str:
+    if not spread:
+        return ""
+    text = number(spread["median"], unit)
+    return text if spread["repeats"] == 1 else f"{text} [{number(spread['q1'], '')} .. {number(spread['q3'], '')}]"
+
+
+def table(document: Mapping[str, Any]) -> str:
+    """The main figures as Markdown, and on which machine, when and of what they were measured."""
+    lines = ["| figure | ours | peer | ratio | target | met |", "| --- | --- | --- | --- | --- | --- |"]
+    for one in document["figures"]:
+        if one["main"]:
+            peer = one["peer_name"] and f"{one['peer_name']}: {_cell(one['peer'], one['unit'])}"
+            met = {True: "yes", False: "**no**", None: ""}[one["met"]]
+            ours, ratio = _cell(one["ours"], one["unit"]), _cell(one["ratio"], "")
+            cells = (one["name"], ours, peer, ratio, one["target"] or "", met)
+            lines.append("| " + " | ".join(str(cell).replace("|", "\\|") for cell in cells) + " |")
+    judged = [one["met"] for one in document["figures"] if one["met"] is not None]
+    machine = document["machine"]
+    said = (f"Median [quartiles] of {machine['cpu']}, {machine['cores']} cores, Python {machine['python']}, "
+            f"{document['date'][:10]}, commit {machine['commit']}, load {document['load_before']:.1f} at the start. "
+            f"Of all targets {sum(judged)} of {len(judged)} are met")
+    missed = [*document["missed"], *document["not_measured"]]
+    return "\n".join([*lines, "", said + (f"; not: {'; '.join(missed)}." if missed else ".")])
+
+
+def put(text: str, new: str) -> str:
+    """A text with something else between `BEGIN` and `END`.
+
+    Raises:
+        ValueError: the two are not there, once each and in this order.
+    """
+    head, begin, rest = text.partition(BEGIN)
+    _, end, tail = rest.partition(END)
+    if not begin or not end or BEGIN in rest or END in head + tail:
+        raise ValueError(f"the lines '{BEGIN}' and '{END}' must be in it, once each and in this order")
+    return f"{head}{BEGIN}\n{new}\n{END}{tail}"
