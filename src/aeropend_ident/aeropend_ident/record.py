@@ -119,6 +119,7 @@ class Tap:
         self.publishers = 0
         self._number: int | None = None  # of the last message, by its publisher's count
         self._skipped = 0
+        self._alone = False
 
     def take(self) -> tuple[int, bytes] | None:
         """Take the next message: receive time (ns) and what was on the wire. None when there is none."""
@@ -135,12 +136,16 @@ class Tap:
         return info["received_timestamp"] or time.time_ns(), message
 
     def count_publishers(self, publishers: int) -> None:
-        """Note how many publishers there are. Only one publisher's numbers, all the while, tell what was lost."""
-        if self.publishers == 1 and publishers <= 1:
+        """Note how many publishers there are. Only one publisher's numbers, all the while, tell what was lost.
+
+        The interval after one has come or gone does not count either: it begins with what waits from both.
+        """
+        alone = self.publishers == 1 and publishers <= 1
+        if alone and self._alone:
             self.lost += self._skipped
         else:
             self._number = None
-        self._skipped = 0
+        self._skipped, self._alone = 0, alone
         self.publishers = publishers
 
 
