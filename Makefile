@@ -19,7 +19,7 @@ ifneq ($(CURDIR)$(PYTHON),$(shell cat .venv/.tree 2>/dev/null))
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test bench blind lint clean distclean
+.PHONY: help demo test bench blind soak lint clean distclean
 
 help: ## show this
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile | expand -t 18
@@ -43,6 +43,10 @@ bench: .venv/.dev ## measure speed beside C, scipy, pysindy and rosbags (ARGS=--
 
 blind: .venv/.dev ## diagnose recordings of withheld effects, then open their labels (ARGS="--count 60 --seed 7")
 	PYTHONPATH=test $(BIN)/python -m blind $(ARGS)
+
+soak: .venv/.runtime ## run a loop for 30 minutes under load, then with faults (ARGS="--minutes 5 --seed 3")
+	tools/setup firmware
+	PYTHONPATH=test $(BIN)/python -m soak $(ARGS)
 
 lint: .venv/.dev ## check style and types
 	$(BIN)/ruff check
