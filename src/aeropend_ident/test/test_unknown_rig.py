@@ -11,8 +11,11 @@ from blind import bags
 from rigs import BENCH, drawn_rig, steps
 
 from aeropend_ident.diagnose import main
+from aeropend_ident.gap import which
+from aeropend_ident.gap.chain import Chains
 from aeropend_ident.gap.diagnosis import diagnose
 from aeropend_ident.gap.signals import Signals
+from aeropend_ident.gap.thrift import ThriftyChains, independent_squares
 from aeropend_ident.gap.unknown_rig import free_swings, grid, noise, reading_sigma, resolution, signals_from
 from aeropend_ident.recording import Recording, RecordingError
 from aeropend_sim import dynamics, rig
@@ -125,6 +128,24 @@ def test_stamps_in_bursts_do():
     assert body["which"]["verdict"] == "coulomb_friction"
 
 
+@pytest.mark.parametrize("wander", [0.012, 0.02])
+def test_a_clock_that_wanders_is_no_effect(wander):
+    t, theta = let_go(14.0, {"coulomb_friction": {"accel": 0.9}}, gravity=56.0, damping=0.13, first=1.3, rate=50.0,
+                      lsb=1e-3)
+    late = np.interp(t + wander * np.sin(2.0 * math.pi * t / 9.0), t, theta)
+    assert verdict(signals_from(recording(t, late), BENCH.sensing))["which"]["effects"] == ["coulomb_friction"]
+
+
+def test_a_narrow_band_is_worth_few_samples():
+    rng = np.random.default_rng(0)
+    white = rng.standard_normal(4000)
+    assert independent_squares(white) == pytest.approx(4000, rel=0.15)
+    ring = np.zeros(4000)
+    for k in range(2, 4000):  # poles at 0.98: correlation 0.98^n cos(0.3 n), the sum of whose squares is 25
+        ring[k] = 2.0 * 0.98 * math.cos(0.3) * ring[k - 1] - 0.98**2 * ring[k - 2] + white[k]
+    assert independent_squares(ring) == pytest.approx(4000 / 25, rel=0.4)
+
+
 def test_runs_that_differ_are_no_effect_and_their_spread_is_told():
     runs = [let_go(8.0, gravity=g, damping=c, first=a, seed=k)
             for k, (g, c, a) in enumerate([(40.0, 0.4, 1.0), (42.0, 0.5, 0.8), (39.0, 0.45, 1.2)])]
@@ -166,6 +187,29 @@ def test_angle_and_command_alone_name_an_effect_in_a_rig_that_nobody_knows():
     for name in ("mgd_over_J", "c_over_J"):
         assert body["which"]["numbers"][name]["value"] == pytest.approx(model.model[name], rel=0.05)
     assert not body["which"]["numbers"]["R_a"]["determined"]
+
+
+def test_thrifty_chains_give_what_others_give_and_count():
+    _, read = unknown(5, duration=6.0)
+    signals = signals_from(read, BENCH.sensing)
+    plain, thrifty = Chains(BENCH, [signals], fit_nominal=True), ThriftyChains(BENCH, [signals])
+    flex = {"mast_flex.coupling": 0.3, "mast_flex.omega": 90.0, "mast_flex.zeta": 0.05}
+    tried = [{}, {"mgd_over_J": 50.0}, {"J_m": 5e-5}, {}, {"mgd_over_J": 50.0, "J_m": 5e-5}, {"initial.omega": 40.0},
+             flex, {"command_delay.delay": 0.03}, {"brush_drop.v_brush": 0.2}, {"sensing.angle_filter_tau": 0.01},
+             {"mgd_over_J": 1e4}, {}]
+    for values in tried:
+        expected = plain.residuals("arm")(values)["theta"]
+        np.testing.assert_allclose(thrifty.residuals("arm")(values)["theta"], expected, rtol=0.0, atol=1e-6)
+    assert thrifty.runs == len(tried)
+
+
+def test_a_search_that_is_cut_short_says_so(monkeypatch):
+    _, read = unknown(3, {"coulomb_friction": {"accel": 0.8}}, duration=20.0)
+    signals = signals_from(read, BENCH.sensing)
+    monkeypatch.setattr(which, "MOST_RUNS", 1)
+    result = diagnose(BENCH, [signals], 2, fit_nominal=True)
+    assert any("cut short" in note for note in result.signals[0].notes)
+    json.dumps(result.body, allow_nan=False)
 
 
 def test_all_channels_give_the_numbers_of_a_rig_that_nobody_knows():

@@ -18,6 +18,7 @@ from aeropend_ident.gap.experiment import next_experiment
 from aeropend_ident.gap.fit import Fit, Unknown, fit
 from aeropend_ident.gap.shape import Shape, hats, shapes
 from aeropend_ident.gap.signals import CHANNELS, Signals
+from aeropend_ident.gap.thrift import ThriftyChains
 from aeropend_ident.gap.timing import timed
 from aeropend_ident.gap.unknowns import (
     ARM,
@@ -133,7 +134,8 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
         with threadpool_limits(1):
             model, recordings = identified.identify(model, recordings)
     with threadpool_limits(1):  # the matrices are narrow: threads of the linear algebra only get in each other's way
-        return _diagnose(timed(Chains(model, recordings, fit_nominal=fit_nominal)), jobs, progress)
+        chains = ThriftyChains(model, recordings) if fit_nominal else Chains(model, recordings)
+        return _diagnose(timed(chains), jobs, progress)
 
 
 def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
@@ -142,6 +144,10 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
     if chains.fit_nominal and free_swinging(recordings):  # few swings: what brakes them shows in the last ones too
         chains = Chains(model, [replace(s, train=len(s)) for s in recordings], fit_nominal=True)
     findings = search(chains, jobs, lambda block, share: progress(f"weighing effects of the {block}", 0.7 * share))
+    if any(f.cut_short for f in findings.values()):
+        said = ("the search was cut short to bound its time: an effect beside the first, or a rival close to it, may "
+                "have been missed")
+        recordings = [replace(s, notes=(*s.notes, said)) for s in recordings]
     progress("looking for chance", 0.7)
     spikes = _spikes(recordings)
     torque, misfit, variables = _random_torque(chains, findings)

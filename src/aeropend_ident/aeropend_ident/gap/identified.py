@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from aeropend_ident.gap.chain import BLOCKS, Chain, Chains
 from aeropend_ident.gap.fit import Fit, fit
 from aeropend_ident.gap.signals import Signals
+from aeropend_ident.gap.thrift import ThriftyChains
 from aeropend_ident.gap.unknown_rig import resolution, turning_points
 from aeropend_ident.gap.unknowns import angle_only, free_swinging, nominal_unknowns
 from aeropend_sim import actuator, dynamics
@@ -224,7 +225,7 @@ def _drawn_out(model: Model, recordings: Sequence[Signals]) -> tuple[Model, Fit]
 
 
 def _fitted(model: Model, recordings: Sequence[Signals], rounds: int = 10) -> tuple[Model, Fit]:
-    chains = Chains(model, recordings, fit_nominal=True)
+    chains = ThriftyChains(model, recordings)
     f = fit(chains.residuals("arm"), nominal_unknowns(chains, "arm"), rounds)
     return chains.each[0].valued(shared(f.values)), f
 

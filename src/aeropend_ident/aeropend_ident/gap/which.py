@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from aeropend_ident.gap.chain import BLOCKS, PLACE_OF_NUMBER, Chains
 from aeropend_ident.gap.fit import Fit, Unknown, fit, screen
 from aeropend_ident.gap.shape import shapes
+from aeropend_ident.gap.thrift import ThriftyChains, independent_squares
 from aeropend_ident.gap.unknowns import NUMBER_SD, free_swinging, initial_unknowns, nominal_unknowns
 from aeropend_sim.effects import CATALOGUE, PARAMETER_MISMATCH
 from aeropend_sim.parameters import PARAMETERS, Model
@@ -26,6 +27,9 @@ EFFECT_ODDS = 1.0 / 50.0
 MATERIAL = 0.3
 """What an effect must explain in one channel at least, RMS in units of a reading's noise, to be worth a word."""
 
+UNSURE = 0.75
+"""As `MATERIAL`, of a rig whose noise is only what the recording shows: it may be a seventh larger."""
+
 SHORTLIST = 8
 """How many hypotheses are fitted in full after the screening."""
 
@@ -35,11 +39,17 @@ STRAYED = 3.0
 FIRST_LOOK, ROUNDS = 2, 10
 """Rounds of a fit for all of the shortlist, and for the likeliest of them."""
 
+FIRST_LOOK_UNKNOWN = 1
+"""As `FIRST_LOOK`, for a rig whose numbers nobody knows: its rounds are longer."""
+
 STEPS, STEPS_UNKNOWN = 4, 12
 """Steps in each round; numbers that nobody knows lie in long valleys."""
 
 CONTENDERS = 4
 """How many of the likeliest are fitted to the end, and compared closely when none of them explains all."""
+
+MOST_RUNS = 3500
+"""Simulations of an unknown rig after which no further effect is looked for, and no fit is taken to the end."""
 
 CLOSE = 1.5
 """Rivals are close when their mean square residuals are within this factor."""
@@ -93,6 +103,7 @@ class Findings:
         block: name of the part.
         base: the fit with the nominal structure. final: the fit with all that was found.
         found: the effects, in the order found, each with its rivals of that round (itself first).
+        cut_short: the search was ended by what it may cost, not by what it found.
     """
 
     block: str
@@ -100,6 +111,7 @@ class Findings:
     final: Fit
     found: list[list[Weighed]] = field(default_factory=list)
     rivals: list[Weighed] = field(default_factory=list)
+    cut_short: bool = False
 
     @property
     def effects(self) -> list[Hypothesis]:
@@ -210,34 +222,34 @@ def _search_block(chains: Chains, block: str, candidates: list[Hypothesis], wher
     nominal = known
     # what brakes a free swing is told by the evidence alone: its noise is known but roughly, and its readings are few
     swinging = chains.fit_nominal and free_swinging(chains.recordings)
+    thrifty = chains if isinstance(chains, ThriftyChains) and not swinging else None
     while len(findings.found) < MOST_EFFECTS:
         current = findings.final
-        if _passes_as_noise(current) and not strayed(chains, block, current) and not swinging:
+        if _passes_as_noise(current, UNSURE if thrifty else MATERIAL) and not strayed(chains, block, current) and (
+                not swinging):
+            break
+        if thrifty is not None and thrifty.runs > MOST_RUNS:
+            findings.cut_short = True
             break
         open_ = [h for h in candidates if h.name not in {g.name for g in findings.effects}]
         chosen = _shortlist(chains, block, open_, known, current)
-        work = [pool.submit(_try, chains, block, h, start, known, current, downstream, where[h.name], FIRST_LOOK)
+        look = FIRST_LOOK if thrifty is None else FIRST_LOOK_UNKNOWN
+        work = [pool.submit(_try, chains, block, h, start, known, current, downstream, where[h.name], look)
                 for h, start in chosen]
         tried = [(h, w.result()) for (h, _), w in zip(chosen, work, strict=True)]
+        done: list[Hypothesis] = []
+        if thrifty is not None:
+            tried, done = _led(chains, block, tried, current, downstream, where, known, pool)
         # the likeliest are fitted to the end
         likeliest = [w.hypothesis for w in _weigh(block, tried, current, downstream, where)[:CONTENDERS]]
-        further = [pool.submit(_try, chains, block, h, 0, known, current, downstream, where[h.name], ROUNDS, f)
-                   if h in likeliest else None for h, f in tried]
+        findings.cut_short |= thrifty is not None and thrifty.runs > MOST_RUNS
+        rounds = FIRST_LOOK if findings.cut_short else ROUNDS
+        further = [pool.submit(_try, chains, block, h, 0, known, current, downstream, where[h.name], rounds, f)
+                   if h in likeliest and h not in done else None for h, f in tried]
         tried = [(h, w.result() if w else f) for (h, f), w in zip(tried, further, strict=True)]
         rivals = _weigh(block, tried, current, downstream, where)
         if not rivals:
             break
-        if chains.fit_nominal and not swinging and rivals[0].gain > 0.0:
-            # numbers that nobody knows may have led the others astray
-            lead = rivals[0]
-            others = [(h, f) for h, f in tried if h is not lead.hypothesis]
-            led = [pool.submit(_try, chains, block, h, 0, known, current, downstream, where[h.name], 2 * FIRST_LOOK,
-                               lead.fit) for h, _ in others]
-            counts = counts_of([lead.fit, *(f for _, f in others)])
-            anew = {h.name: one.result() for (h, _), one in zip(others, led, strict=True)}
-            tried = [(h, anew[h.name] if h.name in anew and anew[h.name].evidence(counts) > f.evidence(counts)
-                      else f) for h, f in tried]
-            rivals = _weigh(block, tried, current, downstream, where)
         rivals = _told_apart_by_place(chains, block, rivals, known)
         # the numbers that a rival was led to may serve as well without it
         again = fit(chains.residuals(block), _started(known, rivals[0].fit.values))
@@ -248,6 +260,9 @@ def _search_block(chains: Chains, block: str, candidates: list[Hypothesis], wher
             rivals = _told_apart_by_place(chains, block, _weigh(block, tried, current, downstream, where), known)
         best = rivals[0]
         matters = best.hypothesis.number or _material(current, best.fit) or strayed(chains, block, current)
+        if swinging and findings.found:  # what leaves a narrow band seems to leave many independent samples
+            odds = [against(current, w.fit) + _log_odds(w.hypothesis) for w in rivals]
+            rivals = [replace(w, probability=min(w.probability, _sure(x))) for w, x in zip(rivals, odds, strict=True)]
         if sum(w.probability for w in rivals) < 0.5 or not matters:
             findings.rivals = rivals
             break
@@ -258,6 +273,29 @@ def _search_block(chains: Chains, block: str, candidates: list[Hypothesis], wher
     _swap(chains, findings, nominal)
     _prune(chains, findings, nominal)
     return findings
+
+
+def _led(chains: Chains, block: str, tried: list[tuple[Hypothesis, Fit]], current: Fit, downstream: Mapping[str, Fit],
+         where: Mapping[str, tuple[str, ...]], known: list[Unknown], pool: ThreadPoolExecutor
+         ) -> tuple[list[tuple[Hypothesis, Fit]], list[Hypothesis]]:
+    """The best fitted to the end, and the others begun anew from its numbers: those that nobody knows lead astray.
+
+    Returns:
+        Each with the better of its fits, and which of them need no further one.
+    """
+    lead = _weigh(block, tried, current, downstream, where)[0]
+    if lead.gain <= 0.0:
+        return tried, []
+
+    def go(h: Hypothesis, rounds: int, begun: Fit) -> Future[Fit]:
+        return pool.submit(_try, chains, block, h, 0, known, current, downstream, where[h.name], rounds, begun)
+
+    best = go(lead.hypothesis, ROUNDS, lead.fit).result()
+    led = [None if h is lead.hypothesis else go(h, FIRST_LOOK_UNKNOWN, best) for h, _ in tried]
+    anew = [best if one is None else one.result() for one in led]
+    counts = counts_of([*anew, *(f for _, f in tried)])
+    better = [(h, max(f, g, key=lambda x: x.evidence(counts))) for (h, f), g in zip(tried, anew, strict=True)]
+    return better, [lead.hypothesis]
 
 
 def _swap(chains: Chains, findings: Findings, nominal: list[Unknown]) -> None:
@@ -455,6 +493,23 @@ def counts_of(fits: Iterable[Fit]) -> dict[str, float]:
     return counts
 
 
+def against(f: Fit, other: Fit) -> float:
+    """Log evidence of `other` over `f`, with as many independent samples as one of these two leaves.
+
+    A third fit, which leaves more, says nothing of how surely these two are told apart; and a narrow band, in which
+    autocorrelations of either sign cancel, is worth fewer than it seems.
+    """
+    counts: dict[str, float] = {}
+    for each in (f, other):
+        for channel, r in each.residuals.items():
+            counts[channel] = max(counts.get(channel, 0.0), min(each.independent[channel], independent_squares(r)))
+    return other.evidence(counts) - f.evidence(counts)
+
+
+def _sure(log_odds: float) -> float:
+    return 1.0 / (1.0 + math.exp(-min(max(log_odds, -500.0), 500.0)))
+
+
 def _log_odds(hypothesis: Hypothesis) -> float:
     """Prior log odds of a hypothesis against none further."""
     return math.log(EFFECT_ODDS / (sum(map(len, BLOCKS.values())) if hypothesis.number else 1))
@@ -479,9 +534,9 @@ def not_strayed(chains: Chains, block: str, f: Fit, known: Iterable[Unknown]) ->
     return fit(lambda values: residuals({**carried, **values}), held)
 
 
-def _passes_as_noise(f: Fit) -> bool:
+def _passes_as_noise(f: Fit, material: float = MATERIAL) -> bool:
     """Whether so little is left that nothing could explain a material part of it."""
-    return all(float(np.mean(r * r)) < 1.0 + 0.5 * MATERIAL**2 for r in f.residuals.values())
+    return all(float(np.mean(r * r)) < 1.0 + 0.5 * material**2 for r in f.residuals.values())
 
 
 def _material(before: Fit, after: Fit) -> bool:
