@@ -6,21 +6,17 @@ Prints a table and writes it as JSON to bench-results/. Ratios are compared with
 """
 
 import argparse
-import json
-import os
-import platform
-import subprocess
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict
 from datetime import datetime, timezone
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+import results
 from benchmarks import bags, control, growth, hardware, history, identification, nodes, readme, simulation
 from benchmarks.measure import Figure, NotMeasuredError, Spread, load, number
 from graph import isolate
@@ -29,10 +25,7 @@ from rich.table import Table
 
 from aeropend_sim.command import Parser
 
-ROOT = Path(__file__).resolve().parent.parent
-RESULTS = ROOT / "bench-results"
-LATEST = "latest.json"
-"""The last full run."""
+RESULTS = results.ROOT / "bench-results"
 FIGURES: dict[str, Callable[[bool], list[Figure]]] = {
     "nominal": simulation.nominal,
     "effects": simulation.all_effects,
@@ -69,29 +62,6 @@ QUIET = 0.5
 """Load average below which the machine counts as idle."""
 
 
-def machine() -> dict[str, object]:
-    """What the figures depend on."""
-
-    def first_line(*command: str) -> str:
-        try:
-            return subprocess.run(command, capture_output=True, text=True, check=True, cwd=RESULTS.parent
-                                  ).stdout.partition("\n")[0]
-        except (OSError, subprocess.CalledProcessError):
-            return "unknown"
-
-    def installed(package: str) -> str:
-        try:
-            return version(package)
-        except PackageNotFoundError:
-            return "unknown"
-
-    cpu = [line.partition(":")[2].strip() for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-           if line.startswith("model name")]
-    return {"cpu": cpu[0] if cpu else platform.machine(), "cores": os.cpu_count(), "kernel": platform.release(),
-            "python": platform.python_version(), **{package: installed(package) for package in PACKAGES},
-            "gcc": first_line("gcc", "--version"), "commit": first_line("git", "describe", "--always", "--dirty")}
-
-
 def cell(spread: Spread | None, unit: str) -> str:
     """Median and quartiles."""
     if spread is None:
@@ -111,25 +81,15 @@ def table(figures: list[Figure]) -> Table:
     return shown
 
 
-def write(document: dict[str, object], folder: Path) -> Path:
-    """Write the results under their date, those of a full run as latest.json too; returns the former."""
-    folder.mkdir(exist_ok=True)
-    (folder / ".gitignore").write_text("*\n", encoding="utf-8")
-    path = folder / f"{datetime.now().astimezone():%Y-%m-%d-%H-%M-%S}.json"
-    for one in (path, folder / LATEST) if document["full"] else (path,):
-        one.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    return path
-
-
-def show(file: Path, results: Path) -> None:
+def show(file: Path, folder: Path) -> None:
     """Write the table of the last full run into a README.
 
     Raises:
         ValueError: there is no such run, or no place for the table; one line.
     """
-    document = history.read(results / LATEST)
+    document = history.full(folder)
     if document is None:
-        raise ValueError(f"{results / LATEST} holds no results: run make bench, without ARGS, first")
+        raise ValueError(f"{folder} holds no full run: run make bench, without ARGS, first")
     try:
         file.write_text(readme.put(file.read_text(encoding="utf-8"), readme.table(document)), encoding="utf-8")
     except OSError as error:
@@ -160,36 +120,36 @@ def measured(names: list[str], quick: bool, console: Console) -> dict[str, objec
     return {
         "format": 1, "date": datetime.now(timezone.utc).isoformat(timespec="seconds"), "quick": quick,
         "full": not quick and set(names) == set(FIGURES), "seconds": round(time.monotonic() - start, 1),
-        "machine": machine(), "load_before": load_before,
+        "machine": results.machine(PACKAGES) | {"gcc": results.first_line("gcc", "--version")},
+        "load_before": load_before,
         "figures": [{**asdict(one), "target": one.target and str(one.target), "met": one.met} for one in figures],
         "not_measured": missing, "missed": [one.name for one in figures if one.met is False],
     }
 
 
-def main(arguments: list[str] | None = None, results: Path = RESULTS) -> int:
+def main(arguments: list[str] | None = None, folder: Path = RESULTS) -> int:
     """Measure what the command line asks for."""
     parser = Parser(prog="bench", description=(__doc__ or "").partition("\n")[0], epilog=EXAMPLES,
                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="shorter and with fewer repeats: 6 minutes, not 35")
     parser.add_argument("--only", nargs="+", choices=FIGURES, metavar="FIGURE", default=list(FIGURES),
                         help=f"measure only these: {', '.join(FIGURES)}")
-    parser.add_argument("--readme", nargs="?", type=Path, const=ROOT / "README.md", metavar="FILE",
+    parser.add_argument("--readme", nargs="?", type=Path, const=results.ROOT / "README.md", metavar="FILE",
                         help="measure nothing, write the table of the last full run into FILE (default: README.md)")
     options = parser.parse_args(arguments)
     if options.readme is not None:
         try:
-            show(options.readme, results)
+            show(options.readme, folder)
         except ValueError as error:
             parser.error(str(error))
         return 0
     console = Console(width=None if sys.stdout.isatty() else 160)
     isolate()
     document: dict[str, Any] = measured(options.only, options.quick, console)
-    then = history.before(results, document["machine"])
+    then = history.full(folder, document["machine"])
     worse = history.worse(document, then) if then else []
-    path = write({**document, "compared_with": then and then["date"], "worse": worse}, results)
-    console.print(f"Median \\[quartiles]; ratio: ours over peer. Written to {path}"
-                  + (f" and {LATEST} beside it." if document["full"] else "."))
+    path = results.write({**document, "compared_with": then and then["date"], "worse": worse}, folder)
+    console.print(f"Median \\[quartiles]; ratio: ours over peer. Written to {path} and latest.json beside it.")
     if then and worse:
         console.print(f"[yellow]{len(worse)} ratios are over {100 * history.WORSE:.0f} % worse than on {then['date']}:")
         console.print("\n".join(f"  {line}" for line in worse), f"\n  meanwhile: {history.changed(document, then)}",

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import bench
 import pytest
+import results
 from benchmarks import growth, history, readme
 from benchmarks.measure import Figure, Spread, Target
 
@@ -54,7 +55,7 @@ def test_what_changed_is_told_with_versions_commit_and_load():
 
 
 def test_compared_is_with_the_last_full_run_of_the_same_machine(tmp_path):
-    assert history.before(tmp_path, MACHINE) is None
+    assert history.full(tmp_path, MACHINE) is None
     for name, one in {
         "2026-01-01-10-00-00": document(date="first"),
         "2026-01-02-10-00-00": document(date="second"),
@@ -64,15 +65,8 @@ def test_compared_is_with_the_last_full_run_of_the_same_machine(tmp_path):
     }.items():
         (tmp_path / f"{name}.json").write_text(json.dumps(one))
     (tmp_path / "2026-01-06-10-00-00.json").write_text('{"format": 1, "da')
-    assert history.before(tmp_path, MACHINE)["date"] == "second"
-
-
-def test_only_a_full_run_is_the_latest(tmp_path):
-    first = bench.write(document(date="full"), tmp_path)
-    bench.write(document(date="part", full=False), tmp_path)
-    assert history.read(first)["date"] in ("full", "part")  # one second may hold both
-    assert history.read(tmp_path / bench.LATEST)["date"] == "full"
-    assert (tmp_path / ".gitignore").read_text() == "*\n"
+    assert history.full(tmp_path, MACHINE)["date"] == "second"
+    assert history.full(tmp_path)["date"] == "other python"
 
 
 class TestReadme:
@@ -87,19 +81,19 @@ class TestReadme:
             assert said in lines[5]
 
     def test_a_copy_of_the_readme_changes_between_the_marks_only(self, tmp_path):
-        bench.write(document(figure(0.1, main=True)), tmp_path)
+        results.write(document(figure(0.1, main=True)), tmp_path)
         copy = tmp_path / "README.md"
         whole = (HERE.parent / "README.md").read_text().replace(readme.BEGIN, "").replace(readme.END, "")
         copy.write_text(f"{whole}\n{readme.BEGIN}\nold\n{readme.END}\nrest\n")
         for _ in range(2):
             assert bench.main(["--readme", str(copy)], tmp_path) == 0
-            table = readme.table(history.read(tmp_path / bench.LATEST))
+            table = readme.table(history.full(tmp_path))
             assert copy.read_text() == f"{whole}\n{readme.BEGIN}\n{table}\n{readme.END}\nrest\n"
 
     @pytest.mark.parametrize("text", [
         "no marks", readme.BEGIN, f"{readme.END} {readme.BEGIN}", f"{readme.BEGIN} {readme.BEGIN} {readme.END}"])
     def test_without_its_marks_it_stays_as_it_is(self, tmp_path, capsys, text):
-        bench.write(document(figure(0.1, main=True)), tmp_path)
+        results.write(document(figure(0.1, main=True)), tmp_path)
         (tmp_path / "copy.md").write_text(text)
         with pytest.raises(SystemExit) as ended:
             bench.main(["--readme", str(tmp_path / "copy.md")], tmp_path)
@@ -116,6 +110,7 @@ class TestReadme:
 
 def test_a_ratio_of_medians_stands_in_where_none_is_measured():
     assert Figure("one", "%", Spread.of([1.0, 2.0, 3.0]), peer_name="p", peer=Spread.of(4.0)).ratio == Spread.of(0.5)
+    assert Figure("count", "of 9", Spread.of(1.0), peer_name="p", peer=Spread.of(4.0)).ratio is None
     assert Figure("none", "%", Spread.of(1.0), peer_name="p", peer=Spread.of(0.0)).ratio is None
 
 

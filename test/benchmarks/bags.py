@@ -166,7 +166,7 @@ def diagnosing(quick: bool) -> list[Figure]:
     of_peer = Spread.of(peers[STEPWISE]["seconds"])
     said = {"diagnose": found["which"], **peers}
     note = f"{EFFECT}: " + ", ".join(f"{name} says {' + '.join(x['effects']) or 'none'}" for name, x in said.items())
-    note += f"; {found['seconds']} s of it the diagnosis itself, the regression {peers[SPARSE]['seconds']:.1f} s"
+    note += f"; {runs[-1].cpu:.1f} s CPU; the regression took {peers[SPARSE]['seconds']:.1f} s"
     return [Figure("diagnose on a 70 s recording", "s", Spread.of(seconds), Target(10.0),
                    STEPWISE, of_peer, Spread.of(seconds / of_peer.median),
                    {"verdict": found["which"], "peers": peers}, note, about, main=True),
@@ -189,4 +189,5 @@ def unknown(quick: bool) -> list[Figure]:
         found = json.loads((Path(folder) / "out0" / "diagnosis.json").read_text(encoding="utf-8"))
     return [Figure("diagnose --fit-nominal, 60 s of angle and command", "s", Spread.of([one.seconds for one in runs]),
                    Target(20.0), details={"verdict": found["which"]},
-                   note=f"verdict {found['which']['verdict']} for cable_torque", load=about, main=True)]
+                   note=f"verdict {found['which']['verdict']} for cable_torque; {runs[-1].cpu:.1f} s CPU", load=about,
+                   main=True)]

@@ -19,7 +19,7 @@ from aeropend_sim import interface
 from aeropend_sim.parameters import SAMPLE_PERIOD
 from benchmarks import measure
 from benchmarks.measure import Figure, NotMeasuredError, Spread, Target
-from benchmarks.nodes import NAMESPACE, SETTLE_S, Process
+from benchmarks.nodes import NAMESPACE, PEER_S, SETTLE_S, Process
 
 LONGEST = "feedback_linearization_cascade"
 """The law that does most, which runs for long."""
@@ -125,17 +125,17 @@ def measured(law: str, seconds: float, *command: str) -> dict[str, float]:
 
 def loop(quick: bool) -> list[Figure]:
     """Each law's node; the one that does most for ten minutes, beside the same law in a plain rclpy node."""
-    seconds, short = (15.0, 8.0) if quick else (600.0, 30.0)
+    seconds, short = (15.0, 8.0) if quick else (600.0, 20.0)
     about = measure.load()
     ours = measured(LONGEST, seconds)
-    peer = measured(LONGEST, min(seconds, 60.0), "plain_controller.py", LONGEST)
+    peer = measured(LONGEST, min(seconds, PEER_S), "plain_controller.py", LONGEST)
     others = {law: measured(law, short) for law in LAWS if law != LONGEST}
     details = {"ours": ours, "peer": peer, **others}
 
     def figure(name: str, unit: str, key: str, target: Target | None, note: str = "") -> Figure:
         return Figure(f"{LONGEST}, {seconds:.0f} s: {name}", unit, Spread.of(ours[key]), target,
-                      f"the law in a plain rclpy node, {min(seconds, 60.0):.0f} s", Spread.of(peer[key]), None, details,
-                      note, about, main=target is not None)
+                      f"the law in a plain rclpy node, {min(seconds, PEER_S):.0f} s", Spread.of(peer[key]), None,
+                      details, note, about, main=target is not None)
 
     return [
         figure("samples missed or without a command", f"of {ours['samples']:.0f}", "missed", Target(0.0)),

@@ -22,11 +22,12 @@ def read(path: Path) -> Document | None:
     return document if isinstance(document, dict) and document.get("format") == 1 else None
 
 
-def before(folder: Path, machine: Mapping[str, object]) -> Document | None:
-    """The latest full run on the same processor with the same Python; None: there is none."""
+def full(folder: Path, machine: Mapping[str, object] | None = None) -> Document | None:
+    """The latest full run, of the same processor with the same Python if one is given; None: there is none."""
     for path in sorted(folder.glob("[0-9]*.json"), reverse=True):
         document = read(path)
-        if document and document.get("full") and all(document["machine"][k] == machine[k] for k in ("cpu", "python")):
+        if document and document.get("full") and (
+                machine is None or all(document["machine"][k] == machine[k] for k in ("cpu", "python"))):
             return document
     return None
 

@@ -6,7 +6,12 @@ import os
 import subprocess
 import sys
 import warnings
-from typing import Any
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from itertools import repeat
+from multiprocessing import get_context
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,75 +60,92 @@ def errors(found: Identified, true: dict[str, dict[str, float]]) -> float:
     return max((abs(found.equations[s][t] / c - 1.0) for s, e in true.items() for t, c in e.items()), default=0.0)
 
 
+def of_each(quick: bool, function: Callable[..., Any], *same: Any, seeds: int = SEEDS) -> list[Any]:
+    """What a function says of each seed, in processes on every core: its accuracy does not depend on its time."""
+    with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
+        return list(pool.map(function, range(QUICK if quick else seeds), *map(repeat, same)))
+
+
+def _exact(seed: int, method: str) -> float:
+    thesis = load("thesis")
+    true = missing() if method.startswith("discrepancy") else in_library(thesis)
+    derivatives = rates(seed) if method.endswith("sindy") else None
+    return errors(identify(given(*states(seed), derivatives), method, known=nominal(mismatched())), true)
+
+
 def exact(quick: bool) -> list[Figure]:
     """Noise-free data of `thesis`: terms and coefficients by every method (thesis 5.2 and 5.4)."""
     about = measure.load()
-    true, absent, known = in_library(load("thesis")), missing(), nominal(mismatched())
     figures = []
     for method, target in (("sindy", 1e-8), ("weak", 1e-4), ("discrepancy-sindy", 1e-3), ("discrepancy-weak", 1e-3)):
-        off = []
-        for seed in range(QUICK if quick else SEEDS):
-            derivatives = rates(seed) if method.endswith("sindy") else None
-            found = identify(given(*states(seed), derivatives), method, known=known)
-            off.append(errors(found, absent if method.startswith("discrepancy") else true))
+        off = of_each(quick, _exact, method)
         figures.append(Figure(f"noise-free thesis, {method}: largest relative error (inf: wrong terms)", "-",
                               Spread.of(max(off)), Target(target), details={"each": off}, load=about))
     return figures
 
 
+class Noisy(NamedTuple):
+    """What came of noisy data: terms right, errors over their limits, error of K_q, terms wrong, s."""
+
+    right: bool
+    ratios: list[float]
+    thrust: float
+    wrong: list[str]
+    seconds: float
+
+
+def _noisy(seed: int, decibel: float) -> Noisy:
+    true = in_library(load("thesis"))
+    y, sigma = noisy(seed, decibel)
+    found = identify(given(y, states(seed)[1]), "weak")
+    ratios = [abs(found.equations[s][t] - true[s][t]) / sd for (s, t), sd in limits(seed, sigma).items()
+              if t in found.equations[s]]
+    got = found.equations["theta_dot"].get("omega*omega", math.inf)
+    wrong = [f"{s}: {t}" for s in STATES for t in set(found.equations[s]) ^ set(true[s])]
+    return Noisy(lorenz.is_exact(found.equations, true), ratios,
+                 abs(got / true["theta_dot"]["omega*omega"] - 1.0), wrong, found.seconds)
+
+
 def noise(quick: bool) -> list[Figure]:
     """The thesis' noisy setting: 70 s of `thesis`, 50 dB; then 40 and 30 dB."""
     figures = []
-    true = in_library(load("thesis"))
     for decibel in (50.0, 40.0, 30.0):
         about = measure.load()
-        right, ratios, thrust, seconds = [], [], [], []
-        lost: dict[str, int] = {}
-        for seed in range(QUICK if quick else SEEDS):
-            y, sigma = noisy(seed, decibel)
-            found = identify(given(y, states(seed)[1]), "weak")
-            right.append(float(lorenz.is_exact(found.equations, true)))
-            seconds.append(found.seconds)
-            limit = limits(seed, sigma)
-            for (s, t), sd in limit.items():
-                if t in found.equations[s]:
-                    ratios.append(abs(found.equations[s][t] - true[s][t]) / sd)
-            for s in STATES:
-                for t in set(found.equations[s]) ^ set(true[s]):
-                    lost[f"{s}: {t}"] = lost.get(f"{s}: {t}", 0) + 1
-            got = found.equations["theta_dot"].get("omega*omega", math.inf)
-            thrust.append(abs(got / true["theta_dot"]["omega*omega"] - 1.0))
-        name = f"{decibel:.0f} dB, weak"
         aim = decibel == 50.0
+        each: list[Noisy] = of_each(quick, _noisy, decibel, seeds=SEEDS if aim else SEEDS // 2)
+        lost = Counter(term for one in each for term in one.wrong)
+        right, ratios = np.mean([x.right for x in each]), np.concatenate([x.ratios for x in each])
+        name = f"{decibel:.0f} dB, weak"
         figures += [
-            Figure(f"{name}: seeds with exactly the true terms", "-", Spread.of(float(np.mean(right))),
-                   Target(0.95, at_least=True) if aim else None, details={"wrong": lost, "seconds": seconds},
+            Figure(f"{name}: seeds with exactly the true terms", "-", Spread.of(float(right)),
+                   Target(0.95, at_least=True) if aim else None,
+                   details={"wrong": lost, "seconds": [x.seconds for x in each]},
                    note="; ".join(f"{k} {n} times" for k, n in lost.items()), load=about, main=aim),
             Figure(f"{name}: error over the Cramér-Rao 1 sigma, 95 % quantile", "-",
                    Spread.of(float(np.quantile(ratios, 0.95))), Target(3.0) if aim else None, load=about, main=aim),
-            Figure(f"{name}: K_q, largest relative error", "-", Spread.of(max(thrust)), Target(0.01) if aim else None,
-                   load=about)]
+            Figure(f"{name}: K_q, largest relative error", "-", Spread.of(max(x.thrust for x in each)),
+                   Target(0.01) if aim else None, load=about)]
     return figures
+
+
+def _chain(seed: int) -> tuple[float, float, float, float]:
+    model = load("bench")
+    true = in_library(model)
+    duty = Excitation(duration=SECONDS, seed=seed).series()
+    read, _ = rig.record(model, duty, seed)
+    try:
+        found = identify(dataset.from_readings({**read, "duty": duty}, SAMPLE_PERIOD, model.sensing), "weak")
+    except RecordingError:  # it said that it cannot tell
+        return 0.0, 0.0, math.inf, math.nan
+    return (float(set(found.equations["theta_dot"]) == set(true["theta_dot"])),
+            float(lorenz.is_exact(found.equations, true)),
+            max((r.gap / r.floor for r in found.free_run.values()), default=math.inf), found.seconds)
 
 
 def chain(quick: bool) -> list[Figure]:
     """Recordings of `bench` through its measurement chain: terms of θ̈, and free runs on held-out data."""
     about = measure.load()
-    model = load("bench")
-    true = in_library(model)
-    arm, every, worst, seconds = [], [], [], []
-    for seed in range(QUICK if quick else SEEDS):
-        duty = Excitation(duration=SECONDS, seed=seed).series()
-        read, _ = rig.record(model, duty, seed)
-        try:
-            found = identify(dataset.from_readings({**read, "duty": duty}, SAMPLE_PERIOD, model.sensing), "weak")
-        except RecordingError:  # it said that it cannot tell
-            arm, every, worst = [*arm, 0.0], [*every, 0.0], [*worst, math.inf]
-            continue
-        arm.append(float(set(found.equations["theta_dot"]) == set(true["theta_dot"])))
-        every.append(float(lorenz.is_exact(found.equations, true)))
-        worst.append(max((r.gap / r.floor for r in found.free_run.values()), default=math.inf))
-        seconds.append(found.seconds)
+    arm, every, worst, seconds = (list(x) for x in zip(*of_each(quick, _chain), strict=True))
     return [Figure("bench recording, weak: seeds with exactly the terms of θ̈", "-", Spread.of(float(np.mean(arm))),
                    Target(0.95, at_least=True), details={"each": arm, "seconds": seconds}, load=about),
             Figure("bench recording, weak: seeds with exactly the terms of all", "-", Spread.of(float(np.mean(every))),
@@ -132,16 +154,19 @@ def chain(quick: bool) -> list[Figure]:
                    Spread.of(worst), Target(2.0), details={"each": worst}, load=about)]
 
 
+def _lorenz(seed: int) -> tuple[bool, bool]:
+    true = lorenz.truth("weak")
+    return (lorenz.is_exact(lorenz.study("weak", 0.05, seed).equations, true),
+            lorenz.is_exact(_pysindy_lorenz(seed), true))
+
+
 def study(quick: bool) -> list[Figure]:
     """The Lorenz system with 5 % noise, beside pysindy's weak form with a threshold that knows the answer."""
     about = measure.load()
-    true = lorenz.truth("weak")
-    seeds = range(QUICK if quick else SEEDS)
-    ours = [float(lorenz.is_exact(lorenz.study("weak", 0.05, seed).equations, true)) for seed in seeds]
-    peer = [float(lorenz.is_exact(_pysindy_lorenz(seed), true)) for seed in seeds]
-    return [Figure("Lorenz, 5 % noise: runs with exactly the true terms", "-", Spread.of(float(np.mean(ours))),
-                   Target(0.9, at_least=True), "pysindy weak form, STLSQ 0.5", Spread.of(float(np.mean(peer))),
-                   load=about, main=True)]
+    _pysindy()
+    ours, peer = np.mean(of_each(quick, _lorenz), axis=0).tolist()
+    return [Figure("Lorenz, 5 % noise: runs with exactly the true terms", "-", Spread.of(ours),
+                   Target(0.9, at_least=True), "pysindy weak form, STLSQ 0.5", Spread.of(peer), load=about, main=True)]
 
 
 def _pysindy() -> Any:

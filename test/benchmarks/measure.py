@@ -55,12 +55,12 @@ class Figure:
 
     Attributes:
         name: what is measured.
-        unit: of ours and peer.
+        unit: of ours and peer; "" or "of ..." of what was counted.
         ours: our program.
         target: what it must reach, if that is agreed.
         peer_name: whom it is compared with.
         peer: the peer, in the same run.
-        ratio: ours over peer, pair by pair; of medians where nothing else is given.
+        ratio: ours over peer, pair by pair; of medians where nothing else is given and nothing was counted.
         details: further numbers for the JSON file.
         note: one line below the table.
         load: processes that wanted a core when the measurement began (1-minute average).
@@ -80,7 +80,8 @@ class Figure:
     main: bool = False
 
     def __post_init__(self) -> None:
-        if self.ratio is None and self.peer is not None and self.peer.median > 0.0:
+        counted = not self.unit or self.unit.startswith("of ")
+        if self.ratio is None and self.peer is not None and self.peer.median > 0.0 and not counted:
             self.ratio = Spread.of(self.ours.median / self.peer.median)
 
     @property

@@ -33,6 +33,8 @@ NAMESPACE = f"/bench_{os.getpid()}"
 """Of every node: another rig on this machine may have hit on the same domain."""
 SETTLE_S = 3.0
 """Start-up that is not measured."""
+PEER_S = 30.0
+"""How long a peer runs at most."""
 
 
 class Process(graph.Process):
@@ -128,12 +130,13 @@ def plant(quick: bool) -> list[Figure]:
     """The plant node in real time, beside a node with an rclpy timer and the same two messages."""
     seconds = 10.0 if quick else 60.0
     about = measure.load()
-    ours, peer = rhythm("plant", seconds), rhythm("timer_node.py", seconds)
+    ours, peer = rhythm("plant", seconds), rhythm("timer_node.py", min(seconds, PEER_S))
     details = {"seconds": seconds, "ours": ours, "peer": peer}
 
     def figure(name: str, unit: str, key: str, limit: float, note: str = "") -> Figure:
-        return Figure(f"plant, {seconds:.0f} s: {name}", unit, Spread.of(ours[key]), Target(limit), "rclpy timer node",
-                      Spread.of(peer[key]), None, details, note, about, main=True)
+        return Figure(f"plant, {seconds:.0f} s: {name}", unit, Spread.of(ours[key]), Target(limit),
+                      f"rclpy timer node, {min(seconds, PEER_S):.0f} s", Spread.of(peer[key]), None, details, note,
+                      about, main=True)
 
     for one in ours, peer:
         one["missed_or_late"] = one["missed"] + one["late"]
@@ -204,7 +207,7 @@ def record(quick: bool) -> list[Figure]:
     about = measure.load()
     with tempfile.TemporaryDirectory(prefix="aeropend_bench_") as folder:
         ours = recorded("record", seconds, Path(folder) / "ours")
-        peer = recorded("plain_recorder.py", min(seconds, 60.0), Path(folder) / "peer")
+        peer = recorded("plain_recorder.py", min(seconds, PEER_S), Path(folder) / "peer")
     for one in ours, peer:
         one["lost_per_minute"] = one["lost"] / one["seconds"] * 60.0
     details = {"ours": ours, "peer": peer}
@@ -215,7 +218,7 @@ def record(quick: bool) -> list[Figure]:
     missing = Spread.of(max(on_grid, short if short > 1.0 else 0.0))
     return [
         Figure(f"record, {seconds:.0f} s beside plant and excite: messages lost", "", missing, Target(0.0),
-               f"rclpy + rosbags Writer, {min(seconds, 60.0):.0f} s",
+               f"rclpy + rosbags Writer, {min(seconds, PEER_S):.0f} s",
                Spread.of(peer["lost"] + peer["without_armature"] + peer["without_angle"]), None, details,
                f"plant counted {ours['plant_published']:.0f}, recorded meanwhile {ours['recorded_meanwhile']:.0f}",
                about, main=True),
