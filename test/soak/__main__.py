@@ -10,11 +10,13 @@ soak-results/.
 import argparse
 import os
 import random
+import shutil
 import signal
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
@@ -29,7 +31,7 @@ from rich.table import Table
 
 from aeropend_sim.command import Parser
 from soak.faults import FAULTS
-from soak.stand import RIGS, Clock, Promise, Stand
+from soak.stand import RIGS, BrokenError, Clock, Promise, Stand
 from soak.steady import Growth, busy, steady
 
 RESULTS = ROOT / "soak-results"
@@ -50,11 +52,12 @@ def steadily(graph: Graph, folder: Path, seconds: float, seed: int, show: Say
     growths: dict[str, object] = {}
     for rig in RIGS:
         stand = Stand(graph, rig, _folder(folder, "steady", rig), seed)
-        with stand, busy():
+        with suppress(BrokenError), stand, busy():
             growth: dict[str, Growth] = steady(stand, seconds / len(RIGS), show)
             growths[rig] = {name: asdict(one) for name, one in growth.items()}
             stand.close()
         promises += stand.promises
+        shutil.rmtree(folder / f"steady_{rig}")
     return promises, growths
 
 
@@ -79,9 +82,10 @@ def _faults(graph: Graph, rig: str, folder: Path, seed: int, clock: Clock, waiti
             goes_on: Callable[[], bool], show: Say) -> list[Promise]:
     """Take faults off the list until one breaks what the others stand on."""
     clock.set(0.0)
+    there = len(waiting)
     stand = Stand(graph, rig, folder, seed, clock)
-    with stand, busy():
-        stand.part = "start"
+    stand.part = "start"
+    with suppress(BrokenError), stand, busy():
         stand.follows()
         while waiting and goes_on():
             stand.part = waiting.pop(0)
@@ -89,6 +93,9 @@ def _faults(graph: Graph, rig: str, folder: Path, seed: int, clock: Clock, waiti
             FAULTS[stand.part].run(stand)
             stand.follows("the loop goes on")
         stand.close()
+    if len(waiting) == there:  # it never started: no fault can be tried
+        waiting.clear()
+    shutil.rmtree(folder)
     return stand.promises
 
 
@@ -131,7 +138,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=30.0, help="how long in all, default 30")
     parser.add_argument("--seed", type=int, default=1, help="of the order of faults and all that is drawn, default 1")
     parser.add_argument("--faults", nargs="*", default=["all"], metavar="FAULT",
-                        help="only those whose name begins like this, or contains it; none: steady work only. "
+                        help="only those that have this in their names; none: steady work only. "
                         + ", ".join(FAULTS))
     options = parser.parse_args()
     if not 0.1 <= options.minutes <= 1e5:

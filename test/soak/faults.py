@@ -30,6 +30,8 @@ PAUSE_S = 1.0
 STEP_S = 7.0
 LATE_NS = 50_000_000
 """Age of a sample that comes at once, on a machine that has other things to do."""
+SILENT_NS = 300_000_000
+"""The least for which a bridge that has lost its board says nothing: its clock must settle anew."""
 ROOM = 150_000
 """Bytes that are left on a disk that becomes full."""
 FLOOD = 20_000
@@ -93,7 +95,7 @@ def stop_rig(stand: Stand) -> None:
     stand.samples(300, "samples again")
     stand.promise("they are ROS time again", lambda: ear.received[-1] - ear.stamps[-1] < LATE_NS)
     after = stand.counted("rig")
-    steps = np.diff(np.array(ear.stamps[since:]))
+    steps = np.diff(np.array(ear.stamps[since - 1:]))
     stand.check("stamps rise", bool((steps > 0).all()))
     if stand.rig == "plant":
         stand.check("they stay on their grid", not (steps % PERIOD_NS).any())
@@ -243,14 +245,16 @@ def reset_board(stand: Stand) -> None:
 
 def _board(stand: Stand, name: str, counter: str, away_s: float) -> None:
     before = stand.counted("rig")[counter]
-    _, since = stand.ear.position()
-    stand.ear.forget_said()
+    since = stand.ear.position()[1] - 1
     at = stand.board.inject(name)
     track = stand.ear.armature
     stand.promise("a gap, and samples again", lambda: len(track) > since + 300 and max(
         np.diff(track.stamps[since:])) > 0.1e9)
     stamps, duty = np.array(track.stamps[since:]), track.values[since:]
     first = int(np.argmax(np.diff(stamps))) + 1
+    heard = stand.ear.commands
+    before_return = np.searchsorted(heard.received, at + SILENT_NS)
+    stand.check("the controller sends duty 0", heard.values[before_return - 1] == 0.0, heard.values[before_return - 1])
     late = (stamps[first] - at) * 1e-9 - away_s
     stand.check("within a second", late < 1.0, f"{late:.2f} s")
     stand.check("the first with duty 0", duty[first] == 0.0, duty[first])
@@ -274,7 +278,7 @@ def clock_step(stand: Stand) -> None:
         stand.promise("stamps are on the clock", lambda ahead=ahead: abs(
             time.time_ns() + 1e9 * ahead - ear.joints.stamps[-1]) < LATE_NS)
         stand.follows("the loop goes on")
-    steps = np.diff(np.array(ear.joints.stamps[since:]))
+    steps = np.diff(np.array(ear.joints.stamps[since - 1:]))
     moved = np.abs(steps - PERIOD_NS) > 1e9
     stand.check("stamps move twice", moved.sum() == 2, int(moved.sum()))
     lost = int((np.round(steps[~moved] / PERIOD_NS) - 1).sum())

@@ -11,7 +11,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +36,8 @@ RECORDING = 100_000
 """Bytes of a bag that has samples in it, not descriptions of topics alone."""
 NEAR = 0.05
 """An arm this near to its reference follows it, rad."""
+LINES = 10
+"""Of each node's output that are kept of a promise that was broken."""
 RIGS = ("plant", "bridge")
 
 Stamps = NDArray[np.int64]
@@ -51,6 +53,7 @@ class Promise:
         what: was promised.
         held: whether it was so.
         found: the figure, or what was there in its place.
+        said: when it was broken, the last lines of each node.
     """
 
     part: str
@@ -58,6 +61,7 @@ class Promise:
     what: str
     held: bool
     found: str
+    said: dict[str, list[str]] = field(default_factory=dict)
 
 
 class BrokenError(Exception):
@@ -123,6 +127,19 @@ class Stand:
         self._stack = ExitStack()
 
     def __enter__(self) -> "Stand":
+        """Start it.
+
+        Raises:
+            BrokenError: it did not start.
+        """
+        try:
+            self._start_all()
+        except AssertionError as error:  # of who waits for what never comes
+            self.check("all starts", False, " ".join(str(error).split())[-300:])
+            raise BrokenError("start") from error
+        return self
+
+    def _start_all(self) -> None:
         with ExitStack() as stack:
             stack.callback(self.graph.node.destroy_publisher, self._publisher())
             self.ear = Ear(self.namespace)
@@ -135,7 +152,6 @@ class Stand:
             for role in self._names:
                 self.start(role)
             self._stack = stack.pop_all()
-        return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
         """End all processes. What a broken promise leaves is told in `promises`, and goes no further."""
@@ -195,7 +211,8 @@ class Stand:
 
     def check(self, what: str, held: bool, found: object = "") -> bool:
         """Note whether a promise was kept."""
-        self.promises.append(Promise(self.part, self.rig, what, bool(held), str(found)))
+        said = {} if held else {role: node.output.splitlines()[-LINES:] for role, node in self.nodes.items()}
+        self.promises.append(Promise(self.part, self.rig, what, bool(held), str(found), said))
         return bool(held)
 
     def wait(self, what: str, condition: Callable[[], object]) -> float:
@@ -273,13 +290,14 @@ class Stand:
         self.check("the service enable answers", done)
 
     def none_lost(self, since: int) -> None:
-        """Check that the stamps have no hole from a sample on."""
+        """Check that the stamps have no hole after so many samples."""
         gone, on_the_way = self.gone(since)
         self.check("no sample is lost meanwhile", gone == 0,
                    f"{gone} of {len(self.ear.joints) - since + gone}, {on_the_way} of them on the way here")
 
     def gone(self, since: int) -> tuple[int, int]:
-        """How many samples are missing since a sample, of one publisher; and how many of them had been published."""
+        """How many samples are missing after so many, of one publisher; and how many of them had been published."""
+        since = max(0, since - 1)
         numbers = np.array(self.ear.joints.numbers[since:])
         return holes(np.array(self.ear.joints.stamps[since:])), int((np.diff(numbers) - 1).clip(0).sum())
 

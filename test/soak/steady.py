@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The first half: nothing happens but work, for long, beside another program that wants a core."""
 
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.stats import linregress, t
@@ -29,6 +31,25 @@ GROWTH_MIB_H = {"rig": 2.0, "controller": 2.0, "recorder": 10.0, "board": 2.0}
 """MiB/h that may surely be exceeded by none. `record` keeps an index of its bag."""
 
 
+class Sleeper:
+    """Runs `soak.sleeper`."""
+
+    def __enter__(self) -> "Sleeper":
+        self._program = subprocess.Popen([sys.executable, "-m", "soak.sleeper"], stdout=subprocess.PIPE, text=True,
+                                         cwd=Path(__file__).parents[1])  # fmt: skip
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._program.kill()
+        self._program.wait()
+
+    def ended(self) -> dict[str, int]:
+        """End it; returns its late ticks and lost ticks."""
+        self._program.send_signal(signal.SIGINT)
+        said, _ = self._program.communicate()
+        return dict(zip(("late ticks", "lost ticks"), map(int, said.split()), strict=True))
+
+
 @dataclass(frozen=True)
 class Growth:
     """How the memory of a process grows: at the end MiB; MiB/h with the bounds of a 95 % interval."""
@@ -45,7 +66,7 @@ class Growth:
         blocks = np.array_split(np.column_stack([seconds, mib])[keep], BLOCKS)
         at, mean = np.array([block.mean(axis=0) for block in blocks if len(block)]).T
         fit = linregress(at / 3600.0, mean)
-        half = float(t.ppf(0.975, len(at) - 2) * fit.stderr)
+        half = float(t.ppf(0.975, len(at) - 2) * np.nan_to_num(fit.stderr))  # NaN: all means are the same
         return cls(mib[-1], float(fit.slope), float(fit.slope) - half, float(fit.slope) + half)
 
 
@@ -72,19 +93,21 @@ def steady(stand: Stand, seconds: float, show: Callable[[str], None]) -> dict[st
     processes = dict(stand.nodes) | ({"board": stand.board.process} if stand.rig == "bridge" else {})
     times: list[float] = []
     memory: dict[str, list[float]] = {name: [] for name in processes}
-    start = refer = look = time.monotonic()
-    while (now := time.monotonic()) < start + seconds:
-        ear.drain()
-        if now >= refer:
-            stand.refer()
-            refer += REFERENCE_S
-        if now >= look:
-            times.append(now)
-            for name, process in processes.items():
-                memory[name].append(stand.memory_mib(process))
-            look += MEMORY_S
-            show(f"{stand.rig}, steady: {now - start:.0f} of {seconds:.0f} s, {len(ear.joints) - since} samples")
-        time.sleep(0.01)
+    with Sleeper() as sleeper:
+        start = refer = look = time.monotonic()
+        while (now := time.monotonic()) < start + seconds:
+            ear.drain()
+            if now >= refer:
+                stand.refer()
+                refer += REFERENCE_S
+            if now >= look:
+                times.append(now)
+                for name, process in processes.items():
+                    memory[name].append(stand.memory_mib(process))
+                look += MEMORY_S
+                show(f"{stand.rig}, steady: {now - start:.0f} of {seconds:.0f} s, {len(ear.joints) - since} samples")
+            time.sleep(0.01)
+        slept = sleeper.ended()
     ear.drain()
     stamps = np.array(ear.joints.stamps[since:])
     commands = len(ear.commands) - commands
@@ -94,7 +117,8 @@ def steady(stand: Stand, seconds: float, show: Callable[[str], None]) -> dict[st
         count = after[name] - rig[name]
         limit = LATE * len(stamps) if name == "late ticks" else 0.0
         stand.check(f"{name}: at most {LATE:g} of all" if limit else f"{name}: none", count <= limit,
-                    f"{count:.0f} of {after['samples'] - rig['samples']:.0f}")
+                    f"{count:.0f} of {after['samples'] - rig['samples']:.0f}"
+                    + (f"; of a program that only sleeps: {slept[name]}" if name in slept else ""))
     count = stand.counted("controller")["lost"] - controller["lost"]
     stand.check("the controller misses no sample", count == 0.0, f"{count:.0f}")
     short = len(stamps) - commands

@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A program that keeps the plant's pace and does nothing else: what it misses, the machine made it miss.
+
+Prints how many ticks were late and how many lost when it is interrupted.
+"""
+
+import signal
+import sys
+
+from aeropend_sim.plant import BACKLOG, PERIOD_NS, Pace
+from aeropend_sim.realtime import go_before_other_programs, prepare_thread
+
+
+def main() -> int:
+    """Sleep until SIGINT."""
+    prepare_thread()
+    go_before_other_programs()
+    pace, lost = Pace(PERIOD_NS, BACKLOG), 0
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        while True:
+            lost += pace.next()
+    except KeyboardInterrupt:
+        print(pace.late, lost)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
