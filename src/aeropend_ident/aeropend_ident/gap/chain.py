@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -39,6 +40,9 @@ PLACE_OF_NUMBER = {
 
 DELAY = "command_delay.delay"
 """The one value of the actuator that acts between samples, where only the motor shows it."""
+
+RECENT = 4
+"""Runs of each of several recordings that are remembered: that of the point, and those of a recording's own values."""
 
 RAN_AWAY = 1e9
 """What the difference to a simulation that is not finite counts as."""
@@ -97,6 +101,11 @@ class Chain:
         chain.feed_motor({})
         chain.feed_arm({})
         return chain
+
+    def head(self, n: int) -> Chain:
+        """The first n samples."""
+        return replace(self, signals=self.signals.head(n), voltage=self.voltage[:n], speed=self.speed[:n],
+                       current=self.current[:n], beyond=self.beyond[:n])
 
     # --- actuator: duty -> voltage
 
@@ -247,16 +256,54 @@ class Chains:
 
     def own(self, values: Values, k: int) -> dict[str, float]:
         """What of the values concerns recording k, under plain names."""
-        plain = {n: v for n, v in values.items() if "@" not in n and (k == 0 or not n.startswith("initial."))}
-        return plain | {n.partition("@")[0]: v for n, v in values.items() if n.endswith(f"@{k}")}
+        return self._owns(values)[k]
+
+    def _owns(self, values: Values) -> list[dict[str, float]]:
+        shared: dict[str, float] = {}
+        own: list[dict[str, float]] = [{} for _ in self.each]
+        for name, value in values.items():
+            plain, _, k = name.partition("@")
+            if k and int(k) < len(own):
+                own[int(k)][plain] = value
+            elif not k:
+                (own[0] if name.startswith("initial.") else shared)[name] = value
+        return [shared | mine for mine in own]
 
     def residuals(self, block: str) -> Callable[[Values], dict[str, Array]]:
         """The residual function of a block over all recordings."""
+        return self.joined(lambda chain, values: chain.residuals(block)(values))
+
+    def joined(self, of: Callable[[Chain, Values], dict[str, Array]]) -> Callable[[Values], dict[str, Array]]:
+        """One residual function over all recordings, of one over each.
+
+        It remembers the last few of each: a value that is one recording's own costs a run of that one, not of all.
+        """
+        recent: list[dict[tuple[object, ...], dict[str, Array]]] = [{} for _ in self.each]
+
         def function(values: Values) -> dict[str, Array]:
-            return {channel + _suffix(k): r for k, chain in enumerate(self.each)
-                    for channel, r in chain.residuals(block)(self.own(values, k)).items()}
+            out: dict[str, Array] = {}
+            for k, (chain, mine) in enumerate(zip(self.each, self._owns(values), strict=True)):
+                if len(self.each) == 1:
+                    return of(chain, mine)
+                key = tuple(mine.items())
+                found = recent[k].pop(key, None) or of(chain, mine)
+                recent[k][key] = found  # the last one now
+                if len(recent[k]) > RECENT:
+                    del recent[k][next(iter(recent[k]))]
+                out.update({channel + _suffix(k): r for channel, r in found.items()})
+            return out
 
         return function
+
+    def head(self, samples: int) -> Chains:
+        """The first recordings, up to so many samples of their training parts and nothing else."""
+        out, left = copy(self), samples
+        out.each = []
+        for chain in self.each:
+            if left > 0:
+                out.each.append(chain.head(min(chain.signals.train, left)))
+                left -= chain.signals.train
+        return out
 
     def feed_next(self, block: str, values: Values) -> None:
         """Feed the part behind a block with what was measured, described by the block with these values."""

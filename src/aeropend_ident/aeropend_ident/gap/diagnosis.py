@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from aeropend_ident.gap import gust as gusts
 from aeropend_ident.gap import identified, shrink, where
-from aeropend_ident.gap.chain import BLOCKS, PLACE_OF_NUMBER, Chains, difference, with_values
+from aeropend_ident.gap.chain import BLOCKS, PLACE_OF_NUMBER, Chain, Chains, difference, with_values
 from aeropend_ident.gap.experiment import next_experiment
 from aeropend_ident.gap.fit import Fit, Unknown, fit
 from aeropend_ident.gap.shape import Shape, hats, shapes
@@ -511,28 +511,24 @@ def _joint(chains: Chains, findings: Mapping[str, Findings]) -> tuple[dict[str, 
             unknowns.update({u.name: u for u in h.starts[0]})
         start.update(f.final.values)
 
-    def residuals(values: dict[str, float]) -> dict[str, Array]:
+    def residuals(chain: Chain, values: Mapping[str, float]) -> dict[str, Array]:
+        s = chain.signals.head(chain.signals.train)
+        readings = shrink.free_run(chains.model, s, values)
         out: dict[str, Array] = {}
-        for k, chain in enumerate(chains.each):
-            s = chain.signals
-            readings = shrink.free_run(chains.model, s, chains.own(values, k))
-            suffix = f"@{k}" if k else ""
-            for channel in ("theta", "i_a", "v_a"):
-                part = slice(s.after_unseen if channel == "v_a" else 0, s.train)
-                out[channel + suffix] = difference(s.channel(channel)[part], readings[channel][part]) / s.sigma[channel]
-            p = s.pulses
-            if p is not None:
-                use = p.index[(p.index < s.train) & ~p.false]
-                sigma = p.sigma[(p.index < s.train) & ~p.false]
-                out["omega" + suffix] = (s.omega[use] - readings["omega"][use]) / sigma
-            elif s.has("omega"):
-                speed = difference(s.true_speed[: s.train], readings["omega"][: s.train])
-                out["omega" + suffix] = speed / s.sigma["omega"]
+        for channel in ("theta", "i_a", "v_a"):
+            part = slice(s.after_unseen if channel == "v_a" else 0, None)
+            out[channel] = difference(s.channel(channel)[part], readings[channel][part]) / s.sigma[channel]
+        p = s.pulses
+        if p is not None:
+            use = p.index[~p.false]
+            out["omega"] = (s.omega[use] - readings["omega"][use]) / p.sigma[~p.false]
+        elif s.has("omega"):
+            out["omega"] = difference(s.true_speed, readings["omega"]) / s.sigma["omega"]
         return out
 
     begun = [Unknown(u.name, u.mean, u.sd, u.low, u.high, start.get(u.name, u.start), u.log)
              for u in unknowns.values()]
-    joint = fit(residuals, begun)
+    joint = fit(chains.joined(residuals), begun)
     return joint.values, {name: WIDER * sd for name, sd in joint.sd.items()}
 
 
@@ -561,7 +557,7 @@ def _checks(chains: Chains, findings: Mapping[str, Findings]) -> dict[str, Check
         own = {u.name for h in f.effects for u in h.starts[0]}
         known = [u for u in nominal_unknowns(chains, block) if u.name in f.final.values and u.name not in own]
         best = shapes(chains, block, f.final, known)[0]
-        chance = 3.0 * sum(len(c.value) for c in best.curves) / sum(len(r) for r in f.final.residuals.values())
+        chance = 3.0 * sum(len(c.value) for c in best.curves) / best.samples
         left = max(best.before - best.left - chance * best.before, 0.0)
         form = math.sqrt(left / max(_mean_square(f.base) - best.left, left, 1e-12))
         rms = {c: float(np.sqrt(np.mean(r * r))) for c, r in f.final.residuals.items()}

@@ -26,8 +26,9 @@ class Unknown:
     """A number to be fitted.
 
     Attributes:
-        name: of the number. mean, sd: of its prior, which is normal, or log-normal if `log` (then sd is that of the
-            logarithm and mean, low and high are positive).
+        name: of the number; one that ends in `@k` changes no channel but those that do.
+        mean, sd: of its prior, which is normal, or log-normal if `log` (then sd is that of the logarithm and mean, low
+            and high are positive).
         low, high: bounds. start: where the search starts; the mean by default.
     """
 
@@ -101,6 +102,13 @@ def independent_samples(r: Array) -> float:
     return float(n / max(time, 1.0))
 
 
+class Slopes:
+    """Derivatives of one channel's residual (N,): `by`: the unknowns that change it; `rows`: (len(by), N)."""
+
+    def __init__(self, by: NDArray[np.intp], n: int) -> None:
+        self.by, self.rows = by, np.empty((len(by), n))
+
+
 class Search:
     """A point in the space of the unknowns, in standard units, with its residuals and their weights."""
 
@@ -128,17 +136,35 @@ class Search:
         """Weighted residuals of all channels as one vector."""
         return np.concatenate([self.weight[k] * residuals[k] for k in self.weight] or [np.zeros(0)])
 
-    def column(self, j: int, step: float = 1e-4) -> Array:
-        """Derivative of the stacked residuals by unknown j, by a difference towards the inside of the bounds."""
-        step = -step if self.z[j] + step > self.high[j] else step
-        z = self.z.copy()
-        z[j] += step
-        return (self.stack(self.at(z)) - self.stack(self.current)) / step
+    def jacobian(self, step: float = 1e-4) -> dict[str, Slopes]:
+        """Derivatives of the weighted residuals, by differences towards the inside of the bounds."""
+        of = [u.name.partition("@")[2] for u in self.unknowns]
+        slopes = {k: Slopes(np.array([j for j, own in enumerate(of) if own in {"", k.partition("@")[2]}], int),
+                            len(self.current[k])) for k in self.weight}
+        for j in range(len(self.z)):
+            z, h = self.z.copy(), -step if self.z[j] + step > self.high[j] else step
+            z[j] += h
+            moved = self.at(z)
+            for k, s in slopes.items():
+                for row in np.flatnonzero(s.by == j):
+                    s.rows[row] = (self.weight[k] * moved[k] - self.weight[k] * self.current[k]) / h
+        return slopes
 
-    def jacobian(self) -> Array:
-        """Derivative of the stacked residuals by every unknown, one row an unknown."""
-        rows = sum(len(self.current[k]) for k in self.weight)
-        return np.array([self.column(j) for j in range(len(self.z))]).reshape(len(self.z), rows)
+    def stacked(self, slopes: Mapping[str, Slopes]) -> Array:
+        """The slopes of all channels as one matrix, one row an unknown."""
+        out, at = np.zeros((len(self.z), sum(s.rows.shape[1] for s in slopes.values()))), 0
+        for s in slopes.values():
+            out[s.by, at:at + s.rows.shape[1]] = s.rows
+            at += s.rows.shape[1]
+        return out
+
+    def normal(self, slopes: Mapping[str, Slopes]) -> tuple[Array, Array]:
+        """The information matrix and the gradient of half the cost, prior included."""
+        information, gradient = np.eye(len(self.z)), self.z.copy()
+        for k, s in slopes.items():
+            information[np.ix_(s.by, s.by)] += s.rows @ s.rows.T
+            gradient[s.by] += s.rows @ (self.weight[k] * self.current[k])
+        return information, gradient
 
     def improve(self, steps: int) -> Array:
         """Levenberg-Marquardt steps with the weights as they are; returns the information matrix, prior included."""
@@ -146,9 +172,7 @@ class Search:
         information = np.eye(len(self.z))
         for _ in range(steps):
             r = self.stack(self.current)
-            jacobian = self.jacobian()
-            information = jacobian @ jacobian.T + np.eye(len(self.z))
-            gradient = jacobian @ r + self.z
+            information, gradient = self.normal(self.jacobian())
             cost = float(r @ r + self.z @ self.z)
             gained = 0.0
             while damping < 1e6:
@@ -207,18 +231,23 @@ def screen(residuals: Callable[[dict[str, float]], Residuals], base: Fit, known:
     """
     search = Search(residuals, [replace(u, start=base.values[u.name]) for u in known])
     r = search.stack(search.current)
-    jacobian = search.jacobian()
+    slopes = search.jacobian()
+    information, gradient = search.normal(slopes)
     cost = float(r @ r + search.z @ search.z)
     left = []
     for group in additions:
         values = {**base.values, **{u.name: u.mean if u.start is None else u.start for u in group}}
         changed = {k: np.asarray(x) for k, x in residuals(values).items() if len(x)}
         column = search.stack({k: changed[k] for k in search.weight}) - r
-        if not np.isfinite(column).all() or not column.any():
+        size = float(column @ column)
+        if not np.isfinite(size) or size == 0.0:
             left.append(1.0)
             continue
-        rows = np.vstack([jacobian, column])
-        information = rows @ rows.T + np.diag([*np.ones(len(search.z)), 1e-9 * float(column @ column)])
-        solution = np.linalg.solve(information, rows @ r + np.append(search.z, 0.0))
-        left.append(max(cost - float((rows @ r + np.append(search.z, 0.0)) @ solution), 0.0) / max(cost, 1e-300))
+        cross, at = np.zeros(len(search.z)), 0
+        for s in slopes.values():
+            cross[s.by] += s.rows @ column[at:at + s.rows.shape[1]]
+            at += s.rows.shape[1]
+        bordered = np.block([[information, cross[:, None]], [cross, (1.0 + 1e-9) * size]])
+        right = np.append(gradient, column @ r)
+        left.append(max(cost - float(right @ np.linalg.solve(bordered, right)), 0.0) / max(cost, 1e-300))
     return left

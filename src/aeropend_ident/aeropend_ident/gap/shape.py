@@ -41,6 +41,13 @@ MEMORY = 2.0
 """s over which what the rotor did may still matter to the air."""
 
 
+MOST_SAMPLES = 100_000
+"""Samples of training data in which shapes are sought: all their curves at once have to fit into memory."""
+
+MOST_AT_ANY_TIME = 25_000
+"""The same with a term free in time, whose knots grow with the time."""
+
+
 @dataclass(frozen=True)
 class Curve:
     """A free curve: `value` (K,), in `unit`, at `knot` (K,) of a variable."""
@@ -58,13 +65,14 @@ class Shape:
     Attributes:
         place: of the chain. curves: the term, as their sum.
         left: mean square of what it leaves, in units of a reading's noise. before: the same without it.
-        independent: how many independent samples that is worth.
+        samples: of all channels, that it was sought in. independent: how many independent ones that is worth.
     """
 
     place: str
     curves: list[Curve]
     left: float
     before: float
+    samples: int
     independent: float
 
 
@@ -258,9 +266,12 @@ def shapes(chains: Chains, block: str, base: Fit, known: Sequence[Unknown], *, a
         chains: cut. block: the part. base: a fit of it. known: the unknowns of that fit that are refitted along.
         any_time: weigh the places of the motor with a term free in time besides (a second or two).
     """
-    begun = [Unknown(u.name, u.mean, u.sd, u.low, u.high, base.values[u.name], u.log) for u in known]
-    search = Search(lambda values: chains.residuals(block)({**base.values, **values}), begun)
-    jacobian = search.jacobian()
+    chains = chains.head(MOST_AT_ANY_TIME if any_time else MOST_SAMPLES)
+    begun = [Unknown(u.name, u.mean, u.sd, u.low, u.high, base.values[u.name], u.log) for u in known
+             if int(u.name.partition("@")[2] or 0) < len(chains.each)]
+    residuals = chains.residuals(block)
+    search = Search(lambda values: residuals({**base.values, **values}), begun)
+    jacobian = search.stacked(search.jacobian())
     weight = np.concatenate([np.full(len(r), w) for r, w in ((search.current[k], search.weight[k])
                                                              for k in search.weight)])
     jacobian = jacobian / weight
@@ -295,5 +306,5 @@ def shapes(chains: Chains, block: str, base: Fit, known: Sequence[Unknown], *, a
             if variable != AT_ANY_TIME:
                 drawn.append(Curve(variable, unit, knots, values[at:at + len(c)]))
             at += len(c)
-        found.append(Shape(place, drawn, left, before, independent_samples(rest)))
+        found.append(Shape(place, drawn, left, before, len(r), independent_samples(rest)))
     return sorted(found, key=lambda shape: shape.left)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +85,15 @@ class Signals:
 
     def __len__(self) -> int:
         return len(self.duty)
+
+    def head(self, n: int) -> Signals:
+        """The first n samples."""
+        p = self.pulses
+        if p is not None:
+            early = p.index < n
+            p = Pulses(*(getattr(p, f.name)[early] for f in fields(p)))
+        return replace(self, duty=self.duty[:n], theta=self.theta[:n], omega=self.omega[:n], i_a=self.i_a[:n],
+                       v_a=self.v_a[:n], pulses=p, false_speed=self.false_speed[:n], train=min(self.train, n))
 
     @property
     def samples(self) -> int:

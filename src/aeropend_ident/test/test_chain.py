@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cut chains of one or more recordings."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from rigs import BENCH, recorded
+
+from aeropend_ident.gap.chain import BLOCKS, Chains
+from aeropend_ident.gap.fit import Search
+from aeropend_ident.gap.unknowns import nominal_unknowns
+
+
+@pytest.fixture(scope="module")
+def chains():
+    return Chains(BENCH, [recorded(seed, duration=8.0) for seed in range(3)])
+
+
+@pytest.mark.parametrize("block", BLOCKS)
+def test_the_training_part_alone_has_the_same_residuals(chains, block):
+    values = {"initial.theta": 0.1, "initial.theta@2": -0.1, "R_a": 1.2, "k1": 0.9 * BENCH.model["k1"]}
+    whole, head = (c.residuals(block)(values) for c in (chains, chains.head(10**6)))
+    assert list(whole) == list(head)
+    for channel, r in whole.items():
+        np.testing.assert_array_equal(r, head[channel])
+
+
+def test_a_head_is_as_long_as_asked_for(chains):
+    train = chains.each[0].signals.train
+    assert [len(c.signals) for c in chains.head(train + 100).each] == [train, 100]
+
+
+def test_a_value_of_one_recording_costs_a_run_of_that_one_alone(chains):
+    runs = Counter()
+
+    def counted(chain, values):
+        runs[next(k for k, one in enumerate(chains.each) if one is chain)] += 1
+        return chain.arm_residuals(values)
+
+    search = Search(chains.joined(counted), nominal_unknowns(chains, "arm"))
+    names = [u.name for u in search.unknowns]
+    shared = sum("@" not in n and not n.startswith("initial.") for n in names)
+    own = sum(n.endswith("@2") for n in names)
+    assert own > 0
+    runs.clear()
+    search.jacobian()
+    assert runs[2] <= shared + own
+    assert sum(runs.values()) < 3 * len(names)
+
+
+def test_slopes_are_those_of_all_residuals_by_all_unknowns(chains):
+    residuals = chains.residuals("arm")
+    search = Search(residuals, nominal_unknowns(chains, "arm"))
+    every = search.stacked(search.jacobian())
+    assert every.shape == (len(search.unknowns), sum(len(r) for r in search.current.values()))
+    for j in range(len(search.unknowns)):
+        z = search.z.copy()
+        z[j] -= 1e-4 * (1.0 if z[j] + 1e-4 > search.high[j] else -1.0)
+        slope = (search.stack(search.at(z)) - search.stack(search.current)) / (z[j] - search.z[j])
+        np.testing.assert_allclose(every[j], slope, rtol=1e-6, atol=1e-9 * np.abs(slope).max())
