@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands as a person runs them: a process, its exit code and what it says."""
 
+import io
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
+from importlib import import_module
 
 
 class Command:
@@ -20,8 +23,13 @@ class Command:
         return subprocess.run(self.line(*arguments), capture_output=True, text=True, check=False, timeout=280)
 
     def refused(self, *arguments: object) -> str:
-        """Run it on what it cannot use, and return the one line that it says."""
-        result = self.run(*arguments)
-        assert (result.returncode, result.stdout) == (2, "")
-        assert len(result.stderr.strip().splitlines()) == 1, result.stderr
-        return result.stderr
+        """Run it in this process, which is quicker, on what it cannot use, and return the one line that it says."""
+        said, error = io.StringIO(), io.StringIO()
+        with redirect_stdout(said), redirect_stderr(error):
+            try:
+                code = import_module(self._module).main([str(word) for word in arguments])
+            except SystemExit as end:
+                code = end.code
+        assert (code, said.getvalue()) == (2, "")
+        assert len(error.getvalue().strip().splitlines()) == 1, error.getvalue()
+        return error.getvalue()
