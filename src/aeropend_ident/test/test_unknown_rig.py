@@ -14,6 +14,7 @@ from aeropend_ident.diagnose import main
 from aeropend_ident.gap import which
 from aeropend_ident.gap.chain import Chains
 from aeropend_ident.gap.diagnosis import diagnose
+from aeropend_ident.gap.experiment import within
 from aeropend_ident.gap.signals import Signals
 from aeropend_ident.gap.thrift import ThriftyChains, independent_squares
 from aeropend_ident.gap.unknown_rig import free_swings, grid, noise, reading_sigma, resolution, signals_from
@@ -210,6 +211,12 @@ def test_a_search_that_is_cut_short_says_so(monkeypatch):
     result = diagnose(BENCH, [signals], 2, fit_nominal=True)
     assert any("cut short" in note for note in result.signals[0].notes)
     json.dumps(result.body, allow_nan=False)
+
+
+@pytest.mark.parametrize("top", [0.003, 0.264, 1.0])
+def test_an_experiment_drives_an_unknown_rig_no_harder_than_it_was_driven(top):
+    for experiment in within(top):
+        assert 0.0 < experiment.series().max() <= max(top, 0.02)
 
 
 def test_all_channels_give_the_numbers_of_a_rig_that_nobody_knows():

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 from aeropend_ident.gap import gust as gusts
 from aeropend_ident.gap import identified, shrink, where
 from aeropend_ident.gap.chain import BLOCKS, PLACE_OF_NUMBER, Chain, Chains, difference, with_values
-from aeropend_ident.gap.experiment import next_experiment
+from aeropend_ident.gap.experiment import EXPERIMENTS, next_experiment, within
 from aeropend_ident.gap.fit import Fit, Unknown, fit
 from aeropend_ident.gap.shape import Shape, hats, shapes
 from aeropend_ident.gap.signals import CHANNELS, Signals
@@ -40,6 +40,7 @@ from aeropend_ident.gap.which import (
     search,
 )
 from aeropend_sim.effects import CATALOGUE
+from aeropend_sim.excitation import Excitation
 from aeropend_sim.parameters import MODEL_NAMES, PARAMETERS, Model
 
 Array = NDArray[np.float64]
@@ -200,6 +201,7 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
         verdict, place = "unknown", strange.shape.place
 
     undecided = _not_separable(findings, UNDECIDED_UNKNOWN if chains.fit_nominal else UNDECIDED)
+    tried = within(max(float(s.duty.max()) for s in recordings)) if chains.fit_nominal else EXPERIMENTS
     augmented = _augmented(model, values, torque, spikes)
     names = [c for c in CHANNELS if c in gap_before.rms]
     body: dict[str, object] = {
@@ -213,7 +215,7 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
                                 for check in checks.values() for channel in check.rms},
                   "unexplained": reasons, "unknown": strange.document() if strange is not None else None,
                   "not_separable": [[a.hypothesis.effect, b.hypothesis.effect] for a, b in undecided],
-                  "next_experiment": _next_experiment(model, recordings[0], undecided, values)},
+                  "next_experiment": _next_experiment(model, recordings[0], undecided, values, tried)},
         "shrink": {"gap": gap_before.total, "gap_after": gap_after.total, "floor": scorer.bottom(gap_before, floors),
                    "closed": share, "low": low, "high": high},
     }
@@ -721,7 +723,7 @@ def _not_separable(findings: Mapping[str, Findings], least: float = UNDECIDED) -
 
 
 def _next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[Weighed, Weighed]],
-                     values: Mapping[str, float]) -> dict[str, object] | None:
+                     values: Mapping[str, float], tried: Sequence[Excitation]) -> dict[str, object] | None:
     """The experiment that would tell the closest pair apart; None where nothing is open."""
     if not pairs:
         return None
@@ -733,7 +735,7 @@ def _next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[Weigh
     one, other = ({**values, **own, **w.fit.values} for w in (first, second))
     if any("@" in n for n in values):
         one, other = identified.shared(one), identified.shared(other)
-    return next_experiment(model, signals, one, other, (first.hypothesis.effect, second.hypothesis.effect))
+    return next_experiment(model, signals, one, other, (first.hypothesis.effect, second.hypothesis.effect), tried)
 
 
 def _augmented(model: Model, values: Mapping[str, float], torque: Weighed | None, spikes: Weighed | None) -> Model:

@@ -53,26 +53,37 @@ STEP = 0.01
 """Standard deviations of its prior by which a parameter is varied to see what it does."""
 
 
-def advise(model: Model, signals: Signals, first: Named, rivals: Sequence[Named]) -> dict[str, object]:
+def within(top: float) -> tuple[Excitation, ...]:
+    """Experiments for a rig of which it is only known that it bears a duty of `top`: one of each kind."""
+    top = max(math.floor(100.0 * top), 2) / 100.0
+    return (Excitation("latin_hypercube", 60.0, duty_max=top),
+            Excitation("steps", 60.0, hold_max=5.0, sequence=(0.0, round(0.7 * top, 3))),
+            Excitation("multisine", 60.0, duty_max=top, frequencies=(0.13, 0.47, 1.09, 2.3, 4.7, 9.1)),
+            Excitation("free_decay", 60.0, duty=top, hold_max=4.0, rest=8.0))
+
+
+def advise(model: Model, signals: Signals, first: Named, rivals: Sequence[Named],
+           experiments: Sequence[Excitation] = EXPERIMENTS) -> dict[str, object]:
     """Choose the duty signal on which a hypothesis differs most from each of its rivals, whatever is refitted.
 
     Args:
         model: the nominal model. signals: the recording that does not tell them apart; its channels and their noise
             are taken.
         first: the hypothesis. rivals: at least one. An effect at its neutral size is no part of a hypothesis.
+        experiments: what is tried.
 
     Returns:
         `why` in words, and `excite`: parameters of that node, empty where no signal helps (contract section 5).
     """
-    tried = {e: _distances(model, signals, first, rivals, e) for e in EXPERIMENTS}
+    tried = {e: _distances(model, signals, first, rivals, e) for e in experiments}
     # a difference grows with the square root of the time
-    grown = {e: [d * math.sqrt(LONGEST / e.duration) for d, _ in tried[e]] for e in EXPERIMENTS}
-    helped = [k for k in range(len(rivals)) if max(grown[e][k] for e in EXPERIMENTS) > APART]
+    grown = {e: [d * math.sqrt(LONGEST / e.duration) for d, _ in tried[e]] for e in experiments}
+    helped = [k for k in range(len(rivals)) if max(grown[e][k] for e in experiments) > APART]
     alike = "; ".join(f"{first[0]} and {rivals[k][0]} give the same readings under every signal tried: to tell them "
                       f"apart, {_directly(model, first, rivals[k])}" for k in range(len(rivals)) if k not in helped)
     if not helped:
         return {"why": alike, "excite": {}}
-    best = max(EXPERIMENTS, key=lambda e: min(tried[e][k][0] for k in helped))
+    best = max(experiments, key=lambda e: min(tried[e][k][0] for k in helped))
     shortfall = APART / max(min(tried[best][k][0] for k in helped), 1e-9)
     if shortfall > 1.0:
         best = replace(best, duration=min(math.ceil(best.duration * shortfall**2 / 30.0) * 30.0, LONGEST))
@@ -87,9 +98,9 @@ def advise(model: Model, signals: Signals, first: Named, rivals: Sequence[Named]
 
 
 def next_experiment(model: Model, signals: Signals, first: Mapping[str, float], second: Mapping[str, float],
-                    names: tuple[str, str]) -> dict[str, object]:
+                    names: tuple[str, str], experiments: Sequence[Excitation] = EXPERIMENTS) -> dict[str, object]:
     """As `advise`, for two hypotheses."""
-    return advise(model, signals, (names[0], first), [(names[1], second)])
+    return advise(model, signals, (names[0], first), [(names[1], second)], experiments)
 
 
 def _distances(model: Model, signals: Signals, first: Named, rivals: Sequence[Named], excitation: Excitation
