@@ -19,7 +19,7 @@ ifneq ($(CURDIR)$(PYTHON),$(shell cat .venv/.tree 2>/dev/null))
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test bench blind soak lint clean distclean
+.PHONY: help demo test bench blind soak coverage lint clean distclean
 
 help: ## show this
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile | expand -t 18
@@ -47,6 +47,9 @@ blind: .venv/.dev ## diagnose recordings of withheld effects, then open their la
 soak: .venv/.runtime ## run a loop for 30 minutes under load, then with faults (ARGS="--minutes 5 --seed 3")
 	tools/setup firmware
 	PYTHONPATH=test $(BIN)/python -m soak $(ARGS)
+
+coverage: .venv/.dev ## tell which lines no test without nodes reaches
+	$(BIN)/python -m pytest -q -n auto --dist loadscope -m "not live" --cov --cov-report=term-missing:skip-covered $(ARGS)
 
 lint: .venv/.dev ## check style and types
 	$(BIN)/ruff check
