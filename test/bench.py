@@ -131,7 +131,7 @@ def main(arguments: list[str] | None = None, folder: Path = RESULTS) -> int:
     """Measure what the command line asks for."""
     parser = Parser(prog="bench", description=(__doc__ or "").partition("\n")[0], epilog=EXAMPLES,
                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="shorter and with fewer repeats: 6 minutes, not 35")
+    parser.add_argument("--quick", action="store_true", help="shorter and with fewer repeats: a fifth of the time")
     parser.add_argument("--only", nargs="+", choices=FIGURES, metavar="FIGURE", default=list(FIGURES),
                         help=f"measure only these: {', '.join(FIGURES)}")
     parser.add_argument("--readme", nargs="?", type=Path, const=results.ROOT / "README.md", metavar="FILE",

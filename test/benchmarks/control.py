@@ -125,7 +125,7 @@ def measured(law: str, seconds: float, *command: str) -> dict[str, float]:
 
 def loop(quick: bool) -> list[Figure]:
     """Each law's node; the one that does most for ten minutes, beside the same law in a plain rclpy node."""
-    seconds, short = (15.0, 8.0) if quick else (600.0, 20.0)
+    seconds, short = (15.0, 8.0) if quick else (600.0, 12.0)
     about = measure.load()
     ours = measured(LONGEST, seconds)
     peer = measured(LONGEST, min(seconds, PEER_S), "plain_controller.py", LONGEST)

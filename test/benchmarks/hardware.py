@@ -225,7 +225,7 @@ def frames(quick: bool) -> list[Figure]:
         note = f"{costly} cost more than the frame that was hit"
         figures.append(Figure(f"frames: {name} accepted", f"of {trials:,}", Spread.of(float(wrong)), Target(0.0),
                               details={"trials": trials, "costly": costly}, note=note, load=about))
-    candidates = TRIALS // 10 if quick else 20 * TRIALS
+    candidates = TRIALS // 10 if quick else 5 * TRIALS
     passed = accepted = 0
     for _ in range(candidates):  # of a sample's length, and right as COBS, which most garbage is not
         payload = protocol.unframe(cobs.encode(rng.randbytes(21)))

@@ -9,6 +9,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from functools import cache
 from itertools import repeat
 from multiprocessing import get_context
 from typing import Any, NamedTuple
@@ -60,10 +61,14 @@ def errors(found: Identified, true: dict[str, dict[str, float]]) -> float:
     return max((abs(found.equations[s][t] / c - 1.0) for s, e in true.items() for t, c in e.items()), default=0.0)
 
 
+@cache
+def _pool() -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(mp_context=get_context("spawn"))  # a fork of numba's threads would hang
+
+
 def of_each(quick: bool, function: Callable[..., Any], *same: Any, seeds: int = SEEDS) -> list[Any]:
     """What a function says of each seed, in processes on every core: its accuracy does not depend on its time."""
-    with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:
-        return list(pool.map(function, range(QUICK if quick else seeds), *map(repeat, same)))
+    return list(_pool().map(function, range(QUICK if quick else seeds), *map(repeat, same)))
 
 
 def _exact(seed: int, method: str) -> float:
@@ -112,7 +117,7 @@ def noise(quick: bool) -> list[Figure]:
     for decibel in (50.0, 40.0, 30.0):
         about = measure.load()
         aim = decibel == 50.0
-        each: list[Noisy] = of_each(quick, _noisy, decibel, seeds=SEEDS if aim else SEEDS // 2)
+        each: list[Noisy] = of_each(quick, _noisy, decibel, seeds=SEEDS if aim else SEEDS // 4)
         lost = Counter(term for one in each for term in one.wrong)
         right, ratios = np.mean([x.right for x in each]), np.concatenate([x.ratios for x in each])
         name = f"{decibel:.0f} dB, weak"

@@ -165,9 +165,13 @@ def recorded(recorder: str, seconds: float, bag: Path) -> dict[str, float]:
         process.check()
     found = recording.read(bag, NAMESPACE)
     on_grid = (found.stamp_ns - found.stamp_ns[0]) % PERIOD_NS == 0
+    whole = np.flatnonzero(np.isfinite(found.v_a) & np.isfinite(found.theta))
+    both = slice(int(whole[0]), int(whole[-1]) + 1)  # one topic is heard before the other: that loses nothing
     result = {"samples": float(len(found)), "seconds": found.duration, "lost": float(found.lost),
               "off_grid": float((~on_grid).sum()), "commands": float(len(found.command)),
-              "without_armature": float(np.isnan(found.v_a).sum()), "without_angle": float(np.isnan(found.theta).sum()),
+              "without_armature": float(np.isnan(found.v_a[both]).sum()),
+              "without_angle": float(np.isnan(found.theta[both]).sum()),
+              "heard_by_halves": float(len(found) - len(found.theta[both])),
               "cpu_percent": 100.0 * cpu / wall}
     return result | _counted(bag, found.stamp_ns)
 
