@@ -87,7 +87,7 @@ class Link:
             if not select.select([fd], [], [], timeout_s)[0]:
                 return b"", time.monotonic_ns()
             now = time.monotonic_ns()
-            data = os.read(fd, 65536)
+            data = os.read(fd, 4096)  # no more than a terminal holds: greater buffers leave holes in the heap
         except BlockingIOError:
             return b"", time.monotonic_ns()
         except (OSError, ValueError) as error:
