@@ -124,7 +124,7 @@ def noise(quick: bool) -> list[Figure]:
         figures += [
             Figure(f"{name}: seeds with exactly the true terms", "-", Spread.of(float(right)),
                    Target(0.95, at_least=True) if aim else None,
-                   details={"wrong": lost, "seconds": [x.seconds for x in each]},
+                   details={"wrong": dict(lost), "seconds": [x.seconds for x in each]},
                    note="; ".join(f"{k} {n} times" for k, n in lost.items()), load=about, main=aim),
             Figure(f"{name}: error over the Cramér-Rao 1 sigma, 95 % quantile", "-",
                    Spread.of(float(np.quantile(ratios, 0.95))), Target(3.0) if aim else None, load=about, main=aim),
