@@ -48,7 +48,7 @@ STEPS, STEPS_UNKNOWN = 4, 12
 CONTENDERS = 4
 """How many of the likeliest are fitted to the end, and compared closely when none of them explains all."""
 
-MOST_RUNS = 2500
+MOST_RUNS = 3500
 """Simulations of an unknown rig after which no further effect is looked for, and no fit is taken to the end."""
 
 CLOSE = 1.5
