@@ -108,6 +108,12 @@ class TestReadme:
         assert "run make bench" in capsys.readouterr().err
 
 
+def test_figures_that_a_document_names_are_measured():
+    texts = [path.read_text(encoding="utf-8") for path in (*HERE.parent.glob("*.md"), *HERE.parent.glob("docs/*.md"))]
+    named = {word for text in texts for words in re.findall(r'ARGS="--only ([^"]+)"', text) for word in words.split()}
+    assert {"plant", "sparse-rig"} <= named <= bench.FIGURES.keys()
+
+
 def test_a_ratio_of_medians_stands_in_where_none_is_measured():
     assert Figure("one", "%", Spread.of([1.0, 2.0, 3.0]), peer_name="p", peer=Spread.of(4.0)).ratio == Spread.of(0.5)
     assert Figure("count", "of 9", Spread.of(1.0), peer_name="p", peer=Spread.of(4.0)).ratio is None

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every command explains itself, and the shell completes it."""
 
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -10,8 +12,14 @@ from pathlib import Path
 import pytest
 
 from aeropend_sim.completion import commands
+from aeropend_sim.effects import CATALOGUE
+from aeropend_sim.parameters import load, to_flat
 
 COMMANDS = {entry.name: entry for entry in commands()}
+MODEL = to_flat(load("bench").with_effects({effect.id: {name: p.default for name, p in effect.parameters.items()}
+                                            for effect in CATALOGUE.values()}))
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("src/*/README.md")]
 
 BASH = """
 eval "$({python} -m aeropend_sim.completion)"
@@ -47,6 +55,22 @@ def test_help_shows_examples_and_exit_codes(name, capsys):
     assert len(examples) >= 2, text
     (codes,) = [line for line in lines if line.startswith("exit codes: 0 ")]
     assert "2 " in codes
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_command_lines_of_a_document_are_understood(path, capsys):
+    """By their help: names of commands, options and parameters."""
+    text = path.read_text(encoding="utf-8")
+    for line in re.findall(r"^    (?:eval \"\$\()?\.venv/bin/(.+?)\)?\"?$|`\.venv/bin/([^`]+)`", text, re.MULTILINE):
+        name, *words = shlex.split("".join(line), comments=True)
+        if name == "python":
+            what = f"src/{words[1].partition('.')[0]}/{words[1].replace('.', '/')}.py" if words[0] == "-m" else words[0]
+            assert (ROOT / what).is_file(), line
+            continue
+        told = set(re.findall(r"[\w.-]+", shown(COMMANDS[name], capsys)))
+        parameters = [word.partition(":=")[0] for word in words if ":=" in word]
+        options = [word for word in words if word.startswith("--") and word not in ("--ros-args", "--params-file")]
+        assert [one for one in [*options, *parameters] if one not in told and one not in MODEL] == [], line
 
 
 def completions(line: str) -> list[str]:

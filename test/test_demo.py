@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from aeropend_ident.demo import NUMBER_ERROR, draw
+from aeropend_sim.effects import CATALOGUE
 from aeropend_sim.parameters import load
 
 pytestmark = pytest.mark.live
@@ -76,3 +78,16 @@ def test_a_wrong_effect_is_one_line():
     _, complained = process.communicate(timeout=60)
     assert process.returncode == 2
     assert len(complained.strip().splitlines()) == 1
+
+
+def test_the_demo_draws_an_effect_and_numbers_a_little_off():
+    nominal = load("bench").model
+    drawn = [draw(None, seed) for seed in range(200)]
+    assert {effect for effect, _ in drawn} == CATALOGUE.keys()
+    for effect, rig in drawn:
+        assert list(rig.effects) == [effect]
+        off = [value / nominal[name] - 1.0 for name, value in rig.model.items() if nominal[name]]
+        assert 0.0 < max(map(abs, off)) <= NUMBER_ERROR
+    assert len({rig.model["R_a"] for _, rig in drawn}) == len(drawn)
+    assert draw("gust", 3)[0] == "gust"
+    assert draw("none", 3)[1].effects == {}

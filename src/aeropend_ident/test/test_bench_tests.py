@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from aeropend_ident import bench_test, bench_tests
+from aeropend_ident import bench_test, bench_tests, thesis
 from aeropend_ident.bench_tests import BenchTestError, Estimate, Rows
 from aeropend_ident.thesis import TABLE_4_1, TABLE_4_2
 from aeropend_sim import actuator, rig
@@ -59,6 +59,18 @@ def test_table_4_2_gives_the_constant_the_thesis_prints_in_volts_per_rpm():
     assert printed.value == pytest.approx(6.606442526e-4, rel=2e-4)
     assert printed.scatter == pytest.approx(1.377310893e-5, rel=1e-2)
     assert found.numbers["K_e"].value == pytest.approx(6.309e-3, rel=1e-3)
+
+
+def test_chapter_4_is_printed_beside_what_comes_out(capsys):
+    assert thesis.main(["4"]) == 0
+    said = capsys.readouterr().out
+    (constant,) = (line for line in said.splitlines() if "K_ω, Table 4.3" in line)
+    assert "6.6e-4 Vs/rad" in constant
+    assert "0.0063" in constant
+    assert "wrong unit: Table 4.2's speeds are RPM" in said
+    for table in ("R_a, Table 4.1", "L_a, 4.4.2", "v_a(τ), (4.3)", "v_a(f), (4.5)", "K_q, Table 4.3"):
+        assert table in said
+    assert [thesis.FIGURES[figure][2] for figure in ("5.7", "5.9")] == [85, 34]  # terms too many
 
 
 def test_equation_4_5_is_the_inverse_of_4_4():

@@ -4,6 +4,7 @@ import pytest
 
 from aeropend_ident.quality import main, planned, quality
 from aeropend_ident.recording import RecordingError
+from aeropend_sim import rig
 from aeropend_sim.excitation import Excitation
 from aeropend_sim.parameters import load
 
@@ -30,3 +31,15 @@ def test_an_input_that_does_nothing_is_refused(capsys):
         planned(BENCH, np.zeros(5000))
     assert main(["--duration", "1"]) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_a_bag_tells_what_it_excites(bags, tmp_path, capsys):
+    said = []
+    for name, duty in {"rich": Excitation(duration=8.0, hold_max=1.0).series(),
+                       "step": np.repeat([0.0, 0.3], [1000, 2000])}.items():
+        columns, _ = rig.record(BENCH, duty, 0)
+        bag = bags.write(tmp_path / name, bags.content(len(duty), columns={**columns, "duty": duty}))
+        assert main([str(bag)]) == 0
+        said.append(capsys.readouterr().out)
+    assert "every term is excited" in said[0]
+    assert "would stay undetermined" in said[1]

@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from aeropend_ident import lorenz
 from aeropend_ident.dataset import from_arrays
 from aeropend_ident.discrepancy import nominal
-from aeropend_ident.identify import Problem, identify, lines
+from aeropend_ident.identify import Problem, document, identify, lines
 from aeropend_ident.output_error import Entries, Fitter
 from aeropend_ident.recording import RecordingError
 from aeropend_ident.sparse import Sums, select
@@ -135,6 +135,8 @@ def test_a_term_that_hangs_on_one_stretch_of_the_recording_is_undetermined():
     assert found.stability["x"]["u"] == 1.0
     assert 0.4 < found.stability["x"]["w"] < 0.8
     assert any("w [undetermined: in " in line for line in lines(found))
+    (listed,) = document(found, "bag", "bench", 0.0)["undetermined"]
+    assert (listed["equation"], listed["term"]) == ("x", "w")
 
 
 def test_such_a_term_is_left_out_where_held_out_data_do_not_miss_it():
@@ -144,6 +146,8 @@ def test_such_a_term_is_left_out_where_held_out_data_do_not_miss_it():
     assert (state, term) == ("x", "w")
     assert often < 0.8
     assert any("w is left out" in line for line in lines(found))
+    (listed,) = document(found, "bag", "bench", 0.0)["undetermined"]
+    assert (listed["term"], listed["left_out"]) == ("w", True)
 
 
 def test_the_normal_equations_of_stretches_add_up_to_those_of_the_whole():
@@ -172,6 +176,46 @@ def test_a_term_that_the_data_cannot_tell_from_another_is_said_to_be_undetermine
     found = identify(from_arrays({"x": x}, {"u": u}, 0.005), "weak")
     pairs = {frozenset((a.term, a.instead)) for a in found.alternatives}
     assert frozenset(("x", "sin(x)")) in pairs
+    listed = document(found, "bag", "bench", 0.0)["undetermined"]
+    assert frozenset(("x", "sin(x)")) in {frozenset((one["term"], one.get("or"))) for one in listed}
+
+
+def pushed(slope, n=3000, period=0.005, seed=7):
+    """x (N,) of x' = slope(x) + u from rest, with noise, and u (N,), held for half a second each."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-1.0, 1.0, n // 100), 100)
+    x = np.zeros(n)
+    for k in range(n - 1):
+        x[k + 1] = x[k]
+        for _ in range(10):
+            x[k + 1] += 0.1 * period * (slope(x[k + 1]) + u[k])
+    return x + 1e-3 * rng.standard_normal(n), u
+
+
+@pytest.mark.parametrize("cubic", [0.0, -40.0])
+def test_what_is_no_sum_of_the_terms_is_noted(cubic):
+    x, u = pushed(lambda x: -2.0 * x + cubic * x**3)
+    found = identify(from_arrays({"x": x}, {"u": u}, 0.005), "weak", ["x", "u", "x*u"])
+    assert any(line.startswith("note: the free run misses") for line in lines(found)) == bool(cubic)
+
+
+def test_nothing_is_fitted_to_what_is_held_out():
+    x, u = pushed(lambda x: -2.0 * x)
+    late = np.arange(len(x)) >= 0.75 * len(x)
+    fitted, other = (identify(from_arrays({"x": one}, {"u": u}, 0.005), "weak", ["x", "u", "x*u"])
+                     for one in (x, np.where(late, -x, x)))
+    assert other.equations == fitted.equations
+    assert other.free_run["x"].gap > 10.0 * fitted.free_run["x"].gap
+
+
+def test_derivatives_may_be_those_of_total_variation():
+    x, u = pushed(lambda x: -2.0 * x)
+    data = from_arrays({"x": x}, {"u": u}, 0.005)
+    found = {way: identify(data, "sindy", ["x", "u", "x*u"], derivative=way) for way in ("smoothed", "tv")}
+    for one in found.values():
+        assert set(one.equations["x"]) == {"x", "u"}
+        assert one.equations["x"]["x"] == pytest.approx(-2.0, rel=0.02)
+    assert found["tv"].held_out_mse != found["smoothed"].held_out_mse
 
 
 @pytest.mark.parametrize(("change", "words"), [
