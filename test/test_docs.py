@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the documents say of the code is so."""
 
+import ast
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.signal import lfilter
 
+from aeropend_control.base import settings
+from aeropend_control.laws import LAWS
+from aeropend_ident import import_table
 from aeropend_sim.completion import commands
 from aeropend_sim.effects import CATALOGUE
 
@@ -16,6 +22,14 @@ ROWS = {cells[0].strip(" `"): cells for cells in (line.strip("|").split("|") for
 
 READMES = [*sorted(ROOT.glob("*.md")), ROOT / "firmware" / "README.md", *sorted(ROOT.glob("src/*/README.md")),
            *sorted(ROOT.glob("docs/*.md"))]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PROMISES = (ROOT / "docs" / "promises.md").read_text(encoding="utf-8")
+
+TESTS = {name for path in [*ROOT.glob("src/*/test/test_*.py"), *ROOT.glob("test/**/test_*.py")]
+         for name in re.findall(r"^ *def (test_\w+)", path.read_text(encoding="utf-8"), re.MULTILINE)}
+TOLD = {path.name: set(re.findall(r"`(test_\w+)`", path.read_text(encoding="utf-8")))
+        for path in ROOT.glob("docs/**/*.md")}
+"""By document, the tests that it names."""
 
 
 def links(path):
@@ -61,3 +75,87 @@ def test_every_command_has_its_row_in_the_readme_of_its_package(entry):
     rows = (ROOT / "src" / package / "README.md").read_text(encoding="utf-8").splitlines()
     (row,) = [row for row in rows if row.startswith(f"| `{entry.name}` |")]
     assert len(row.split("|")[2].strip()) > 10
+
+
+@pytest.mark.parametrize("name", [name for name, told in TOLD.items() if told])
+def test_a_document_names_tests_that_are_there(name):
+    assert sorted(TOLD[name] - TESTS) == []
+
+
+def test_the_promises_and_the_page_on_the_network_name_tests():
+    assert min(len(TOLD[name]) for name in ("promises.md", "network.md")) > 20
+    assert "`test_" not in README  # it is for those who use all this
+
+
+KEPT = r"`test_|`make |`python |`tools/|not tested: \w|network\.md"
+"""What may stand in the second column of the promises."""
+
+
+def test_every_section_of_the_readme_has_its_table_of_promises():
+    assert re.findall("^## .+", PROMISES, re.MULTILINE) == re.findall("^## .+", README, re.MULTILINE)
+    for section in PROMISES.split("\n## ")[1:]:
+        title, head, rule, *rows = [line for line in section.splitlines() if line]
+        assert (head, rule) == ("| the README says | kept by |", "| --- | --- |"), title
+        kept = [row.rpartition(" | ")[2] for row in rows]
+        assert [one for one in kept if not re.search(KEPT, one)] == []
+
+
+def test_the_readme_has_every_command_at_its_package():
+    rows = dict(re.findall(r"^\| \[(aeropend_\w+)\]\(.*?\) \| (.+) \|$", README, re.MULTILINE))
+    entries = {entry.name: entry.module.partition(".")[0] for entry in commands()}
+    assert {name: package for package, holds in rows.items() for name in re.findall(r"`(\w+)`", holds)} == entries
+
+
+def test_laws_references_and_limits_are_those_of_the_readme():
+    told = re.findall(r"^\| `(\w+)` \| (?:PID|the same|speed).*? \| (.+) \|$", README, re.MULTILINE)
+    assert {law for law, _ in told} == LAWS.keys()
+    angle = [kind for kind in LAWS.values() if kind.measures == "theta"]
+    assert next(reference for _, reference in told) == "rad from hanging, 0 to 1.2"
+    assert [kind.reference_limits for kind in angle] == [(0.0, 1.2)] * 3
+    for kind in LAWS.values():
+        timeout, limit = (settings(kind)[name].default for name in ("timeout", "angle_limit"))
+        assert f"no sample for {1000.0 * timeout:g} ms (`timeout`)" in README
+        assert f"the arm beyond {limit:g} rad (`angle_limit`)" in README
+
+
+PIECE = re.compile(r"^    from aeropend_.+?(?=\n\n\S|\Z)", re.MULTILINE | re.DOTALL)
+"""Lines of Python."""
+
+
+@pytest.mark.parametrize("path", [path for path in READMES if PIECE.search(path.read_text(encoding="utf-8"))],
+                         ids=lambda path: str(path.relative_to(ROOT)))
+def test_python_in_a_document_runs(path):
+    """A piece that ends in a value identifies x' = -2 x + u and y' = -3 y + u."""
+    u = np.repeat(np.random.default_rng(0).uniform(-1.0, 1.0, 50), 60)
+    x, y = (lfilter([0.0, 0.002], [1.0, 0.002 * rate - 1.0], u) for rate in (2.0, 3.0))
+    noise = 1e-4 * np.random.default_rng(1).standard_normal((2, len(u)))
+    for piece in PIECE.findall(path.read_text(encoding="utf-8")):
+        body = ast.parse("\n".join(line[4:] for line in piece.splitlines()))
+        names = {"x": x + noise[0], "y": y + noise[1], "u": u}
+        last = body.body.pop() if isinstance(body.body[-1], ast.Expr) else None
+        exec(compile(body, str(path), "exec"), names)
+        if last is not None:
+            found = eval(compile(ast.Expression(last.value), str(path), "eval"), names)
+            assert {state: set(equation) for state, equation in found.items()} == {"x": {"x", "u"}, "y": {"y", "u"}}
+
+
+def test_import_proposes_what_the_readme_shows(tmp_path, monkeypatch, capsys):
+    shown = README.partition(".venv/bin/import messung.csv\n")[2].partition("\n\nSay")[0]
+    angle = np.array([-83.0, -83.0, -82.9, -83.2, 1.4, *[-40.0] * 595])
+    rows = [f"{0.02 * k:.3f};{theta:.1f}".replace(".", ",") + f";{255 * (k > 99)}\n" for k, theta in enumerate(angle)]
+    (tmp_path / "messung.csv").write_text("Zeit [s];Winkel [°];Tastgrad\n" + "".join(rows), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "120")
+    assert import_table.main(["messung.csv"]) == 2
+    said = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert [line for line in shown.splitlines() if line.split() not in said] == []
+
+
+TARGETS = set(re.findall(r"^(\w+):.*## ", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+
+
+@pytest.mark.parametrize("path", READMES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_make_targets_that_a_document_names_are_there(path):
+    named = set(re.findall(r"(?:^    |`)make ([a-z]+)", path.read_text(encoding="utf-8"), re.MULTILINE))
+    assert named <= TARGETS
+    assert path.name != "README.md" or path.parent != ROOT or {"demo", "test", "blind", "bench", "lint"} <= named
