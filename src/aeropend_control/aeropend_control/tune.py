@@ -34,7 +34,7 @@ EXAMPLES = f"""examples:
 {EXIT_CODES}"""
 
 
-def parse(arguments: Sequence[str]) -> argparse.Namespace:
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Read the command line; exits with 2 and one line where it is wrong."""
     parser = Parser(prog="tune", description=__doc__, epilog=EXAMPLES,
                     formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -112,7 +112,7 @@ def _number(value: float, digits: int) -> str:
 @interruptible
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
-    options = parse(sys.argv[1:] if arguments is None else arguments)
+    options = parse(arguments)
     kind = LAWS[options.law]
     try:
         model = load(options.model)

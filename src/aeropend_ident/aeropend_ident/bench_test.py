@@ -23,7 +23,7 @@ from aeropend_ident.bench_tests import BenchTestError, Estimate, Found, Rows
 from aeropend_ident.output import OutputError, check, whole
 from aeropend_ident.picture import scatter
 from aeropend_ident.recording import Recording, RecordingError
-from aeropend_sim.command import Parser, interruptible, own
+from aeropend_sim.command import Parser, interruptible
 from aeropend_sim.parameters import PRESETS, Model, ModelError, from_flat, load, save
 
 FILES = ("bench.yaml", "bench_tests.json", "bench_tests.svg")
@@ -156,7 +156,7 @@ examples:
 exit codes: 0 numbers were written, 2 the input cannot be used (one line says why), 130 interrupted"""
 
 
-def parse(arguments: Sequence[str]) -> argparse.Namespace:
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Read the command line; exits with 2 and one line where it is wrong."""
     parser = Parser(prog="bench_test", epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
                     description="Work out the numbers of motor and propeller from bench tests.")
@@ -214,7 +214,7 @@ def run(options: argparse.Namespace) -> None:
 @interruptible
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
-    options = parse(own(arguments))
+    options = parse(arguments)
     try:
         run(options)
     except (BenchTestError, RecordingError, ModelError, OutputError) as error:

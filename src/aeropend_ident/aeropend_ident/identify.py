@@ -33,7 +33,7 @@ from aeropend_ident.sindy import DERIVATIVES, Regression, regress
 from aeropend_ident.sparse import Sums, select
 from aeropend_ident.terms import Array, Library, TermError, thesis_terms
 from aeropend_ident.weak import NUMERIC, Weak, half_width, sided
-from aeropend_sim.command import Parser, between, interruptible, own
+from aeropend_sim.command import Parser, between, interruptible
 from aeropend_sim.parameters import PRESETS, ModelError, load
 from aeropend_sim.progress import Show, nothing, progress
 
@@ -490,7 +490,7 @@ EXAMPLES = """examples:
 exit codes: 0 equations were written, 2 the input cannot be used (one line says why), 130 interrupted"""
 
 
-def parse(arguments: Sequence[str]) -> argparse.Namespace:
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Read the command line; exits with 2 and one line where it is wrong."""
     parser = Parser(prog="identify", epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
                     description="Find sparse equations of motion in a recording, or what must be added to a model's.")
@@ -545,7 +545,7 @@ def _listed(text: str) -> list[str]:
 @interruptible
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
-    options = parse(own(arguments))
+    options = parse(arguments)
     try:
         run(options)
     except (RecordingError, ModelError, OutputError, TermError) as error:

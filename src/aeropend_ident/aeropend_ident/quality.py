@@ -129,7 +129,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.add_argument(f"--{name.replace('_', '-')}", type=float, default=getattr(plan, name), metavar="X",
                             help=f"{meaning}; default %(default)s")
     parser.add_argument("--seed", type=int, default=plan.seed, help="of the signal and the noise; default %(default)s")
-    options = parser.parse_args(list(sys.argv[1:] if arguments is None else arguments))
+    options = parser.parse_args(arguments)
     try:
         model = load(options.model)
         with progress("reading") as show:

@@ -37,10 +37,10 @@ class Parser(argparse.ArgumentParser):
     def parse_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> argparse.Namespace:
-        """Read a command line; exits with 2 and one line where it is wrong."""
+        """Read a command line, but for what is ROS's; exits with 2 and one line where it is wrong."""
         if asked_to_complete():
             self.complete()
-        return super().parse_args(args, namespace)
+        return super().parse_args(own(args), namespace)
 
     def complete(self) -> None:
         """Tell the shell what may come next, and end."""
