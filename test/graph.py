@@ -45,7 +45,7 @@ AGAIN_S = 5.0
 def isolate() -> None:
     """Keep this process and those it starts on this machine and in a domain of their own."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    os.environ["ROS_DOMAIN_ID"] = str(os.getpid() % 102)
+    os.environ["ROS_DOMAIN_ID"] = str(os.getpid() % 50)
     os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="aeropend_log_")
 
 

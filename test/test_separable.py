@@ -41,9 +41,7 @@ CASES = [
     Case("thrust_lag", {"encoder_lag"}, 700, WIGGLE, {"thrust_lag": {"tau": 0.03}}),
     Case("encoder_lag", {"thrust_lag"}, 701, WIGGLE, {"encoder_lag": {"tau": 0.015}}),
     Case("angle_offset", {"encoder_eccentricity", "cable_torque"}, 702, WIGGLE, {"angle_offset": {}}),
-    Case("encoder_eccentricity", {"angle_offset"}, 710, WIGGLE, {"encoder_eccentricity": {}}),
     Case("cable_torque", {"thrust_exponent"}, 709, CREEP, {"cable_torque": {}}),
-    Case("parameter_mismatch:c_over_J", {"axial_inflow"}, 718, WIGGLE, numbers={"c_over_J": 1.4}),
 ]
 
 

@@ -10,7 +10,7 @@ import pytest
 from aeropend_sim.parameters import load
 from blind import score, unknown
 
-SEED, COUNT, DURATION = 4243, 9, 30.0
+SEED, COUNT, DURATION = 4243, 9, 20.0
 
 pytestmark = pytest.mark.timeout(600)
 

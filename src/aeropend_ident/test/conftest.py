@@ -134,6 +134,10 @@ def bags() -> Bags:
     return Bags()
 
 
+WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:]) % 2
+"""Which of two processes that run tests beside each other this is."""
+
+
 class Processes:
     """Starts programs on a ROS domain of this test's own, and ends by process id what is left of them."""
 
@@ -143,7 +147,7 @@ class Processes:
         Processes._number += 1
         self.environment = {
             **os.environ,
-            "ROS_DOMAIN_ID": str(1 + Processes._number % 100),
+            "ROS_DOMAIN_ID": str(50 + 25 * WORKER + Processes._number % 25),  # below 50: those of test/graph.py
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
             "PYTHONUNBUFFERED": "1",
         }

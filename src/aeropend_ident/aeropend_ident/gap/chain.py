@@ -41,9 +41,6 @@ PLACE_OF_NUMBER = {
 DELAY = "command_delay.delay"
 """The one value of the actuator that acts between samples, where only the motor shows it."""
 
-RECENT = 4
-"""Runs of each of several recordings that are remembered: that of the point, and those of a recording's own values."""
-
 RAN_AWAY = 1e9
 """What the difference to a simulation that is not finite counts as."""
 
@@ -274,24 +271,10 @@ class Chains:
         return self.joined(lambda chain, values: chain.residuals(block)(values))
 
     def joined(self, of: Callable[[Chain, Values], dict[str, Array]]) -> Callable[[Values], dict[str, Array]]:
-        """One residual function over all recordings, of one over each.
-
-        It remembers the last few of each: a value that is one recording's own costs a run of that one, not of all.
-        """
-        recent: list[dict[tuple[object, ...], dict[str, Array]]] = [{} for _ in self.each]
-
+        """One residual function over all recordings, of one over each."""
         def function(values: Values) -> dict[str, Array]:
-            out: dict[str, Array] = {}
-            for k, (chain, mine) in enumerate(zip(self.each, self._owns(values), strict=True)):
-                if len(self.each) == 1:
-                    return of(chain, mine)
-                key = tuple(mine.items())
-                found = recent[k].pop(key, None) or of(chain, mine)
-                recent[k][key] = found  # the last one now
-                if len(recent[k]) > RECENT:
-                    del recent[k][next(iter(recent[k]))]
-                out.update({channel + _suffix(k): r for channel, r in found.items()})
-            return out
+            return {channel + _suffix(k): r for k, (chain, own) in enumerate(zip(self.each, self._owns(values)))
+                    for channel, r in of(chain, own).items()}
 
         return function
 

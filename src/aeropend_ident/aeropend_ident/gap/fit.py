@@ -26,7 +26,7 @@ class Unknown:
     """A number to be fitted.
 
     Attributes:
-        name: of the number; one that ends in `@k` changes no channel but those that do.
+        name: of the number; `x@k` is the x of the channels that end in `@k`.
         mean, sd: of its prior, which is normal, or log-normal if `log` (then sd is that of the logarithm and mean, low
             and high are positive).
         low, high: bounds. start: where the search starts; the mean by default.
@@ -137,17 +137,26 @@ class Search:
         return np.concatenate([self.weight[k] * residuals[k] for k in self.weight] or [np.zeros(0)])
 
     def jacobian(self, step: float = 1e-4) -> dict[str, Slopes]:
-        """Derivatives of the weighted residuals, by differences towards the inside of the bounds."""
-        of = [u.name.partition("@")[2] for u in self.unknowns]
-        slopes = {k: Slopes(np.array([j for j, own in enumerate(of) if own in {"", k.partition("@")[2]}], int),
-                            len(self.current[k])) for k in self.weight}
-        for j in range(len(self.z)):
-            z, h = self.z.copy(), -step if self.z[j] + step > self.high[j] else step
-            z[j] += h
+        """Derivatives of the weighted residuals, by differences towards the inside of the bounds.
+
+        What each of several recordings has its own of is moved in all of them at once.
+        """
+        moves = np.where(self.z + step > self.high, -step, step)
+        groups: dict[str, dict[str, int]] = {}
+        for j, u in enumerate(self.unknowns):
+            name, _, recording = u.name.partition("@")
+            groups.setdefault(name, {})[recording] = j
+        by = {k: [g.get(k.partition("@")[2], g.get("", -1)) for g in groups.values()] for k in self.weight}
+        slopes = {k: Slopes(np.array([j for j in by[k] if j >= 0], int), len(self.current[k])) for k in self.weight}
+        filled = dict.fromkeys(slopes, 0)
+        for at, group in enumerate(groups.values()):
+            z = self.z.copy()
+            z[list(group.values())] += moves[list(group.values())]
             moved = self.at(z)
             for k, s in slopes.items():
-                for row in np.flatnonzero(s.by == j):
-                    s.rows[row] = (self.weight[k] * moved[k] - self.weight[k] * self.current[k]) / h
+                if (j := by[k][at]) >= 0:
+                    s.rows[filled[k]] = (self.weight[k] * moved[k] - self.weight[k] * self.current[k]) / moves[j]
+                    filled[k] += 1
         return slopes
 
     def stacked(self, slopes: Mapping[str, Slopes]) -> Array:
