@@ -126,6 +126,11 @@ class PtyBoard:
                     self._send(self.garbage + protocol.frame(payload))
                     self.garbage = b""
 
+    def litter(self, data: bytes) -> None:
+        """Send these bytes before the next sample."""
+        with self._lock:
+            self.garbage += data
+
     def _wait(self, until_ns: float) -> None:
         """Listen to commands until then."""
         while (left := until_ns - time.monotonic_ns()) > 0:

@@ -154,7 +154,7 @@ def test_garbage_on_the_line_is_refused_counted_and_costs_nothing_else(rig, grap
     joints, _, _ = ends
     before = rig.counters()
     for k in range(20):
-        rig.board.garbage = bytes(range(k, 40 + k)) + b"\0"
+        rig.board.litter(bytes(range(k, 40 + k)) + b"\0")
         graph.until(lambda: not rig.board.garbage, "the garbage to be sent")
     counters = rig.counters(lambda values: int(values["bad frames"]) >= int(before["bad frames"]) + 20)
     assert counters["lost samples"] == before["lost samples"]

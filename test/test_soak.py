@@ -17,8 +17,9 @@ from soak.stand import PERIOD_NS, Clock, Stand, holes, missing
 from soak.steady import WARM_UP_S, Growth, busy, steady
 
 SECONDS = 12.0
-ALONE = ("kill_controller", "stop_controller", "clock_step", "two_plants")
-"""Others are tested where they belong: kill -9 and full disks in test_kill.py, the board in test_swap.py and so on."""
+ALONE = ("kill_controller", "stop_controller", "clock_step")
+"""Others are tested where they belong (kill -9 and full disks in test_kill.py, the board in test_swap.py, ...) or take a
+machine with nothing else to do: `make soak`."""
 TEST = Path(__file__).parent
 
 

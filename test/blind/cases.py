@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
@@ -130,13 +130,18 @@ class Sizer:
         y, v, _ = plant.states(p, duty, np.zeros(0))
         ideal, real = plant.shown(p, y, v), plant.measured(p, y, v, sensing, rng)
         self.floor = {c: float(np.sqrt(np.mean((real[c] - ideal[c]) ** 2))) for c in ideal}
-        self.base = self.stack(ideal)
-        columns = []
-        for name in NUMBERS:
-            if numbers[name] != 0.0:
-                moved = self.packed({}, {}, other=False, numbers={**numbers, name: 1.01 * numbers[name]})
-                y, v, _ = plant.states(moved, duty, np.zeros(0))
-                columns.append((self.stack(plant.shown(moved, y, v)) - self.base) / 0.01)
+        self.absorb(NUMBERS)
+
+    def absorb(self, names: Sequence[str]) -> None:
+        """Find what the rig reads without effects, and which way a refit of these numbers moves it."""
+        def read(numbers: Mapping[str, float]) -> Array:
+            p = self.packed({}, {}, other=False, numbers=numbers)
+            y, v, _ = plant.states(p, self.duty, np.zeros(0))
+            return self.stack(plant.shown(p, y, v))
+
+        self.base = read(self.numbers)
+        columns = [(read({**self.numbers, name: 1.01 * self.numbers[name]}) - self.base) / 0.01
+                   for name in names if self.numbers[name] != 0.0]
         self.q, self.r = np.linalg.qr(np.array(columns).T)
 
     def packed(self, effects: Mapping[str, Mapping[str, float]], outside: Mapping[str, float], *, other: bool,

@@ -77,16 +77,7 @@ class AngleSizer(cases.Sizer):
 
     def __init__(self, numbers: Mapping[str, float], tau: float, duty: Array, floor: float) -> None:
         self.numbers, self.tau, self.duty, self.floor = dict(numbers), tau, duty, {"theta": floor}
-        p = self.packed({}, {}, other=False)
-        y, v, _ = plant.states(p, duty, np.zeros(0))
-        self.base = self.stack(plant.shown(p, y, v))
-        columns = []
-        for name in NUMBERS:
-            if numbers[name] != 0.0:
-                moved = self.packed({}, {}, other=False, numbers={**numbers, name: 1.01 * numbers[name]})
-                y, v, _ = plant.states(moved, duty, np.zeros(0))
-                columns.append((self.stack(plant.shown(moved, y, v)) - self.base) / 0.01)
-        self.q, self.r = np.linalg.qr(np.array(columns).T)
+        self.absorb(NUMBERS)
 
     def left(self, p: Array, gusts: Array) -> float:
         """Floors RMS that a refit of the numbers leaves of the gap."""
