@@ -34,7 +34,8 @@ test: .venv/.dev ## build and test with colcon in a temporary folder, then run e
 	$(MAKE) -C firmware
 	tools/colcon-check
 	$(BIN)/python -m pytest -n auto --dist loadscope -m "not live" $(ARGS) || [ $$? = 5 -a -n "$(ARGS)" ]
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -m live --reruns 2 -rR $(ARGS) || [ $$? = 5 -a -n "$(ARGS)" ]
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "live and not alone" --reruns 2 -rR $(ARGS) || [ $$? = 5 -a -n "$(ARGS)" ]
+	$(BIN)/python -m pytest -m alone --reruns 2 -rR $(ARGS) || [ $$? = 5 -a -n "$(ARGS)" ]
 
 bench: .venv/.dev ## measure speed beside C, scipy, pysindy and rosbags (ARGS=--quick; ARGS=--readme writes the README's table)
 	tools/setup compiler

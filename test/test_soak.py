@@ -18,8 +18,8 @@ from soak.steady import WARM_UP_S, Growth, busy, steady
 
 SECONDS = 12.0
 ALONE = ("kill_controller", "stop_controller", "clock_step")
-"""Others are tested where they belong (kill -9 and full disks in test_kill.py, the board in test_swap.py, ...) or take a
-machine with nothing else to do: `make soak`."""
+"""Others are tested where they belong (kill -9 and full disks in test_kill.py, the board in test_swap.py, ...), or take
+more than a test: `make soak`."""
 TEST = Path(__file__).parent
 
 
@@ -27,6 +27,7 @@ def broken(stand):
     return [one for one in stand.promises if not one.held]
 
 
+@pytest.mark.alone
 def test_the_board_in_a_recorded_loop_beside_a_busy_program_loses_nothing(graph, tmp_path):
     with Stand(graph, "bridge", tmp_path, seed=1) as stand, busy():
         steady(stand, SECONDS, print)
@@ -44,6 +45,7 @@ def plant(graph, tmp_path_factory):
         yield stand
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("name", ALONE)
 def test_what_is_promised_of_a_fault_is_kept(plant, name):
     plant.promises.clear()
