@@ -15,8 +15,9 @@ from aeropend_ident.gap import which
 from aeropend_ident.gap.chain import Chains
 from aeropend_ident.gap.diagnosis import diagnose
 from aeropend_ident.gap.experiment import within
+from aeropend_ident.gap.fit import independent_samples
 from aeropend_ident.gap.signals import Signals
-from aeropend_ident.gap.thrift import ThriftyChains, independent_squares
+from aeropend_ident.gap.thrift import ThriftyChains
 from aeropend_ident.gap.unknown_rig import free_swings, grid, noise, reading_sigma, resolution, signals_from
 from aeropend_ident.recording import Recording, RecordingError
 from aeropend_sim import dynamics, rig
@@ -140,11 +141,11 @@ def test_a_clock_that_wanders_is_no_effect(wander):
 def test_a_narrow_band_is_worth_few_samples():
     rng = np.random.default_rng(0)
     white = rng.standard_normal(4000)
-    assert independent_squares(white) == pytest.approx(4000, rel=0.15)
+    assert independent_samples(white, power=2) == pytest.approx(4000, rel=0.15)
     ring = np.zeros(4000)
     for k in range(2, 4000):  # poles at 0.98: correlation 0.98^n cos(0.3 n), the sum of whose squares is 25
         ring[k] = 2.0 * 0.98 * math.cos(0.3) * ring[k - 1] - 0.98**2 * ring[k - 2] + white[k]
-    assert independent_squares(ring) == pytest.approx(4000 / 25, rel=0.4)
+    assert independent_samples(ring, power=2) == pytest.approx(4000 / 25, rel=0.4)
 
 
 def test_runs_that_differ_are_no_effect_and_their_spread_is_told():

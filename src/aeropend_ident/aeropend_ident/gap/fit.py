@@ -84,8 +84,13 @@ class Fit:
         return total
 
 
-def independent_samples(r: Array) -> float:
-    """How many independent samples a residual (N,) is worth: N over its integrated autocorrelation time."""
+def independent_samples(r: Array, power: int = 1) -> float:
+    """How many independent samples a residual (N,) is worth: N over its integrated autocorrelation time.
+
+    Args:
+        r: the residual. power: 2 asks it of the mean square, whose scatter autocorrelations of either sign widen alike,
+            those of a narrow band included.
+    """
     n = len(r)
     if n < 16:
         return float(n)
@@ -94,7 +99,7 @@ def independent_samples(r: Array) -> float:
     if correlation[0] <= 0.0:
         return float(n)
     correlation = correlation / correlation[0]
-    running = 1.0 + 2.0 * np.cumsum(correlation[1:])
+    running = 1.0 + 2.0 * np.cumsum(correlation[1:] ** power)
     # Sokal's window: stop where the lag exceeds five times the time found so far
     lags = np.arange(1, len(correlation))
     stop = np.flatnonzero(lags >= 5.0 * running)

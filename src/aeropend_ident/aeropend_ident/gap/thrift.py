@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft, next_fast_len, rfft
 
 from aeropend_ident.gap.chain import Chain, Chains, Values
 from aeropend_ident.gap.signals import Signals
@@ -71,18 +70,3 @@ class ThriftyChains(Chains):
             return function(values)
 
         return counted
-
-
-def independent_squares(r: Array) -> float:
-    """How many independent samples the mean square of a residual (N,) is worth, a narrow band included.
-
-    Autocorrelations of either sign widen the scatter of a mean square alike: N over the sum of their squares.
-    """
-    n = len(r)
-    if n < 16 or not r.any():
-        return float(n)
-    size = next_fast_len(2 * n, real=True)
-    correlation = irfft(np.abs(rfft(r, size)) ** 2, size)[: n // 4]
-    running = 1.0 + 2.0 * np.cumsum((correlation[1:] / correlation[0]) ** 2)
-    stop = np.flatnonzero(np.arange(1, len(correlation)) >= 5.0 * running)  # Sokal's window
-    return float(n / (running[stop[0]] if len(stop) else running[-1]))

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from aeropend_ident.gap.chain import BLOCKS, PLACE_OF_NUMBER, Chains
-from aeropend_ident.gap.fit import Fit, Unknown, fit, screen
+from aeropend_ident.gap.fit import Fit, Unknown, fit, independent_samples, screen
 from aeropend_ident.gap.shape import shapes
-from aeropend_ident.gap.thrift import ThriftyChains, independent_squares
+from aeropend_ident.gap.thrift import ThriftyChains
 from aeropend_ident.gap.unknowns import NUMBER_SD, free_swinging, initial_unknowns, nominal_unknowns
 from aeropend_sim.effects import CATALOGUE, PARAMETER_MISMATCH
 from aeropend_sim.parameters import PARAMETERS, Model
@@ -502,7 +502,8 @@ def against(f: Fit, other: Fit) -> float:
     counts: dict[str, float] = {}
     for each in (f, other):
         for channel, r in each.residuals.items():
-            counts[channel] = max(counts.get(channel, 0.0), min(each.independent[channel], independent_squares(r)))
+            own = min(each.independent[channel], independent_samples(r, power=2))
+            counts[channel] = max(counts.get(channel, 0.0), own)
     return other.evidence(counts) - f.evidence(counts)
 
 
