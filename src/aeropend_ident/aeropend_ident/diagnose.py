@@ -109,7 +109,7 @@ def run(options: argparse.Namespace, command: str) -> None:
                           for bags in (options.bags, options.test))
         found = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal,
                          progress=lambda what, share: show(share, what))
-        shown = [{"bag": bag, **across(model, found.augmented, s)} for bag, s in zip(options.test, tests)]
+        shown = [{"bag": bag, **across(found.model, found.augmented, s)} for bag, s in zip(options.test, tests)]
         body = document(found, options.bags, options.model, time.monotonic() - started, shown)
         results = Results.of(found, body, command)
     results.write(out, overwrite=options.overwrite)

@@ -2,14 +2,17 @@
 """The cut chains of one or more recordings."""
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from rigs import BENCH, recorded
 
-from aeropend_ident.gap.chain import BLOCKS, Chains
+from aeropend_ident.gap.chain import BLOCKS, Chain, Chains
 from aeropend_ident.gap.fit import Search
 from aeropend_ident.gap.unknowns import nominal_unknowns
+from aeropend_sim import actuator
+from aeropend_sim.parameters import SAMPLE_PERIOD
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +32,15 @@ def test_the_training_part_alone_has_the_same_residuals(chains, block):
 def test_a_head_is_as_long_as_asked_for(chains):
     train = chains.each[0].signals.train
     assert [len(c.signals) for c in chains.head(train + 100).each] == [train, 100]
+
+
+@pytest.mark.parametrize("speed", [0.0, 120.0])
+def test_until_a_late_command_acts_the_voltage_is_what_the_rotor_begins_with(speed):
+    signals = recorded(1, duration=8.0, without=("v_a", "i_a", "omega"))
+    chain = Chain.cut(BENCH, replace(signals, duty=np.full(len(signals), 0.3)))
+    v = chain.actuator({"command_delay.delay": 20 * SAMPLE_PERIOD, "initial.omega": speed})
+    np.testing.assert_allclose(v[:20], actuator.voltage_at(BENCH.model, speed), atol=1e-9)
+    np.testing.assert_allclose(v[20:], actuator.voltage(BENCH.model, 0.3), atol=1e-9)
 
 
 def test_what_each_recording_has_its_own_of_costs_no_more_runs_with_more_recordings(chains):

@@ -57,6 +57,18 @@ def test_an_addition_that_explains_nothing_lowers_the_evidence():
     assert with_.evidence(with_.independent) < without.evidence(with_.independent)
 
 
+def test_two_hypotheses_that_fit_alike_have_the_same_evidence_wherever_their_searches_began():
+    wave = np.sin(3.0 * T)
+    y = 40.0 * wave + RNG.standard_normal(len(T))
+    fits = [fit(lambda values: {"y": y - values["size"] * wave}, [Unknown("size", 0.0, 1e4, start=start)], rounds=1)
+            for start in (39.9, -300.0)]
+    assert fits[1].independent["y"] == pytest.approx(fits[0].independent["y"], rel=0.05)
+    found = [f.evidence(fits[0].independent) for f in fits]  # far away the residual was coloured, and counted for less
+    assert found[1] == pytest.approx(found[0], abs=0.01)
+    assert fits[0].simplicity({"y": 2000.0}) == pytest.approx(
+        -0.5 * (40.0 / 1e4) ** 2 - 0.5 * np.log(1.0 + 1e8 * np.sum(wave**2) / fits[0].scale["y"] ** 2), abs=0.05)
+
+
 def test_bounds_hold_and_logarithms_stay_positive():
     data = line(RNG.standard_normal(len(T)), slope=2.0)
     found = fit(data, [Unknown("slope", 1.0, 0.5, 0.1, 1.5), OFFSET])

@@ -12,10 +12,13 @@ from rigs import BENCH, drawn_rig, steps
 
 from aeropend_ident.diagnose import main
 from aeropend_ident.gap import which
+from aeropend_ident.gap.across import across
 from aeropend_ident.gap.chain import Chains
 from aeropend_ident.gap.diagnosis import diagnose
 from aeropend_ident.gap.experiment import within
 from aeropend_ident.gap.fit import independent_samples
+from aeropend_ident.gap.hypotheses import hypotheses
+from aeropend_ident.gap.identified import identify, with_effect
 from aeropend_ident.gap.signals import Signals
 from aeropend_ident.gap.thrift import ThriftyChains
 from aeropend_ident.gap.unknown_rig import free_swings, grid, noise, reading_sigma, resolution, signals_from
@@ -138,6 +141,15 @@ def test_a_clock_that_wanders_is_no_effect(wander):
     assert verdict(signals_from(recording(t, late), BENCH.sensing))["which"]["effects"] == ["coulomb_friction"]
 
 
+def test_the_gap_on_another_recording_is_that_of_the_identified_model():
+    first, other = (signals_from(recording(*let_go(8.0, first=a, seed=k)), BENCH.sensing)
+                    for k, a in enumerate((1.0, 0.7)))
+    found = diagnose(BENCH, [first], 2, fit_nominal=True)
+    identified, guessed = (across(m, found.augmented, other) for m in (found.model, BENCH))
+    assert identified["gap"] < 1.5 * identified["floor"]
+    assert guessed["gap"] > 5.0 * identified["gap"]
+
+
 def test_a_narrow_band_is_worth_few_samples():
     rng = np.random.default_rng(0)
     white = rng.standard_normal(4000)
@@ -189,6 +201,23 @@ def test_angle_and_command_alone_name_an_effect_in_a_rig_that_nobody_knows():
     for name in ("mgd_over_J", "c_over_J"):
         assert body["which"]["numbers"][name]["value"] == pytest.approx(model.model[name], rel=0.05)
     assert not body["which"]["numbers"]["R_a"]["determined"]
+
+
+@pytest.mark.parametrize(("effect", "parameter", "size"), [
+    ("thrust_exponent", "n", 1.3), ("thrust_lag", "tau", 0.25), ("command_delay", "delay", 0.12)])
+def test_an_effect_of_the_drive_is_identified_together_with_the_numbers(effect, parameter, size):
+    model, read = unknown(4, {effect: {parameter: size}}, duration=25.0)
+    signals = signals_from(read, BENCH.sensing)
+    misled, _ = identify(BENCH, [signals])
+    (unknown_,) = next(h.starts[0] for h in hypotheses(BENCH) if h.effect == effect)
+    found = with_effect(misled, [signals], unknown_)
+    assert found[unknown_.name] == pytest.approx(size, rel=0.25)
+    assert found["mgd_over_J"] == pytest.approx(model.model["mgd_over_J"], rel=0.05)
+
+
+def test_chance_is_not_taken_for_what_it_looks_like():
+    _, read = unknown(8, {"gust": {"sigma": 0.05, "tau": 0.3}}, duration=60.0)
+    assert verdict(signals_from(read, BENCH.sensing))["which"]["effects"] == ["gust"]
 
 
 def test_thrifty_chains_give_what_others_give_and_count():

@@ -9,8 +9,9 @@ from rigs import BENCH, drawn_rig, steps
 
 from aeropend_ident.gap.chain import Chains
 from aeropend_ident.gap.diagnosis import diagnose
+from aeropend_ident.gap.hypotheses import from_linear, linear_unknowns
 from aeropend_ident.gap.signals import from_arrays
-from aeropend_ident.gap.which import from_linear, linear_unknowns, search
+from aeropend_ident.gap.which import search
 from aeropend_sim import rig
 from aeropend_sim.effects import CATALOGUE
 from aeropend_sim.parameters import SAMPLE_PERIOD

@@ -4,11 +4,16 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aeropend_ident.gap import shrink
-from aeropend_ident.gap.chain import Values
+from aeropend_ident.gap.chain import Values, difference
+from aeropend_ident.gap.fit import fit
 from aeropend_ident.gap.signals import Signals
+from aeropend_ident.gap.unknowns import state_of_arm
 from aeropend_sim.parameters import Model
+
+Array = NDArray[np.float64]
 
 FORGOTTEN = 5.0
 """s after which the arm no longer remembers the state that it started in."""
@@ -19,25 +24,30 @@ def across(model: Model, augmented: Model, signals: Signals) -> dict[str, float 
 
     Args:
         model: the nominal model. augmented: with what other recordings of the rig showed.
-        signals: the recording. It is judged from `FORGOTTEN` on, or from its middle if that comes first: its state at
-            the start is known only as well as it was read.
+        signals: the recording. It is judged from `FORGOTTEN` on, or from its middle if that comes first; what comes
+            before tells the state that it starts in, and nothing else.
 
     Returns:
         `gap`, `gap_after`, `floor`, `closed`, `low`, `high`, as `shrink` in `diagnosis.json` (contract section 5).
     """
     start = min(round(FORGOTTEN / signals.period), len(signals) // 2)
     left_out = signals.false_speed if "speed_spikes" in augmented.effects else None
-    state = _first_read(signals)
-    before = shrink.gap(shrink.free_run(model, signals, state), signals, start, len(signals))
-    after = shrink.gap(shrink.free_run(augmented, signals, state), signals, start, len(signals), left_out)
+    runs = [shrink.free_run(m, signals, _started(m, signals.head(start))) for m in (model, augmented)]
+    before, after = (shrink.gap(run, signals, start, len(signals), leave)
+                     for run, leave in zip(runs, (None, left_out), strict=True))
     floors = shrink.floor(signals, start, len(signals))
     bottom = float(np.sqrt(np.mean([(floors[c] / before.spread[c]) ** 2 for c in before.rms])))
     share, low, high = shrink.closed(before, after, floors)
     return {"gap": before.total, "gap_after": after.total, "floor": bottom, "closed": share, "low": low, "high": high}
 
 
-def _first_read(signals: Signals) -> Values:
-    """The state at the first sample as far as it is read."""
-    angles = signals.theta[np.isfinite(signals.theta)][:10]
+def _started(model: Model, signals: Signals) -> Values:
+    """The state at the first sample with which the model follows the angle best."""
     speeds = signals.omega[np.isfinite(signals.omega)][:1]
-    return {"initial.theta": float(np.mean(angles)), "initial.omega": float(speeds[0]) if len(speeds) else 0.0}
+    read = {"initial.omega": float(speeds[0])} if len(speeds) else {}
+
+    def residuals(values: Values) -> dict[str, Array]:
+        angle = shrink.free_run(model, signals, {**read, **values})["theta"]
+        return {"theta": difference(signals.theta, angle) / signals.sigma["theta"]}
+
+    return {**read, **fit(residuals, state_of_arm(model, signals, "")).values}

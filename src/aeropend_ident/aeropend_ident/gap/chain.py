@@ -113,8 +113,9 @@ class Chain:
     def _voltage(self, values: Values, of: Callable[..., Array]) -> Array:
         s, m = self.signals, with_values(self.model, values)
         n = m.numbers()
-        before = float(actuator.duty(n, s.v_a[0]) if np.isfinite(s.v_a[0]) else s.duty[0])
-        v = of(n, s.duty, m.effects, s.period, before=before)
+        # what acted before the recording, and with a delay acts on, is what the rotor begins with
+        first = s.v_a[0] if np.isfinite(s.v_a[0]) else actuator.voltage_at(n, values.get("initial.omega", 0.0))
+        v = of(n, s.duty, m.effects, s.period, before=float(actuator.duty(n, first)))
         v = v - m.effects.get("supply_sag", {}).get("r_supply", 0.0) * self.current
         return v + m.effects.get("voltage_offset", {}).get("bias", 0.0)
 

@@ -16,6 +16,7 @@ from aeropend_ident.gap import identified, shrink, where
 from aeropend_ident.gap.chain import BLOCKS, PLACE_OF_NUMBER, Chain, Chains, difference, with_values
 from aeropend_ident.gap.experiment import EXPERIMENTS, next_experiment, within
 from aeropend_ident.gap.fit import Fit, Unknown, fit
+from aeropend_ident.gap.hypotheses import EFFECT_ODDS, Hypothesis, log_odds
 from aeropend_ident.gap.shape import Shape, hats, shapes
 from aeropend_ident.gap.signals import CHANNELS, Signals
 from aeropend_ident.gap.thrift import ThriftyChains
@@ -31,14 +32,8 @@ from aeropend_ident.gap.unknowns import (
     nominal_unknowns,
     number_unknowns,
 )
-from aeropend_ident.gap.which import (
-    EFFECT_ODDS,
-    Findings,
-    Hypothesis,
-    Weighed,
-    not_strayed,
-    search,
-)
+from aeropend_ident.gap.weighing import Weighed, counts_of
+from aeropend_ident.gap.which import Findings, not_strayed, search
 from aeropend_sim.effects import CATALOGUE
 from aeropend_sim.excitation import Excitation
 from aeropend_sim.parameters import MODEL_NAMES, PARAMETERS, Model
@@ -54,7 +49,7 @@ RANDOM_TORQUE = 0.35
 and free curves leave more than this share of what it does to the angle."""
 
 PLAIN = 15.0
-"""Log evidence from which on an effect of several parameters is there, however unsure each of them is."""
+"""Log evidence from which on an effect is there in an unknown rig, however unsure its size is."""
 
 SURE = 2.5
 """Standard deviations by which an effect must differ from none, and a number from nominal, after the joint fit."""
@@ -100,7 +95,8 @@ class Diagnosis:
     """What was found.
 
     Attributes:
-        model: the nominal model. augmented: with refitted numbers and found effects.
+        model: the nominal model, of a rig whose numbers nobody knows the identified one.
+        augmented: with refitted numbers and found effects.
         signals: the recordings. before, after: channel -> (N,) free-run readings, per recording.
         body: the content of `diagnosis.json` from `channels` on (contract section 5).
         misfit: what the nominal structure leaves where it fits worst, and the variables beside it, name -> (M,).
@@ -221,6 +217,7 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
     }
     if chains.fit_nominal:
         body["identified"] = _identified(chains, values, sd)
+        model = with_values(model, identified.shared(base_values))
     progress("done", 1.0)
     return Diagnosis(model, augmented, recordings, before, after, body, {"misfit": misfit, **variables})
 
@@ -412,7 +409,7 @@ def _spikes(recordings: Sequence[Signals]) -> Weighed | None:
         return None
     name = "speed_spikes.rate"
     rate, sd = count / time, math.sqrt(count) / time
-    return Weighed(Hypothesis("speed_spikes"), Fit({name: rate}, {name: sd}, {}, {}, {}, 0.0), gain,
+    return Weighed(Hypothesis("speed_spikes"), Fit({name: rate}, {name: sd}, {}, {}, {}, 0.0, {}), gain,
                    1.0 / (1.0 + math.exp(-min(gain, 500.0))))
 
 
@@ -421,43 +418,74 @@ def _random_torque(chains: Chains, findings: Mapping[str, Findings]) -> tuple[We
     block = max(BLOCKS, key=lambda b: _misfit_of(findings[b].base))
     chain = chains.each[0]
     s = chain.signals
-    final = findings["arm"].final
-    torque: Weighed | None = None
-    own = chains.own(final.values, 0)
-    n = with_values(chains.model, own).numbers()
-
-    def fitted(values: Mapping[str, float]) -> gusts.Gust:
-        return gusts.fit_gust((s.theta - chain.arm(values))[: s.train], s.theta[: s.train], n["mgd_over_J"],
-                              n["c_over_J"], s.sigma["theta"], s.period)
-
-    if final.scale.get("theta", 1.0) > GOOD_ENOUGH:
-        g = fitted(own)
-        theta, speed = _angle(chains, s)[g.index], chain.speed[g.index]
-        rate = np.gradient(_calm(theta), g.index * s.period)
-        slope = np.gradient(speed, g.index * s.period)
-        columns = np.hstack([*(hats(x)[0] for x in (theta, rate, speed, slope)), (speed * rate)[:, None]])
-        known = [Unknown(u.name, u.mean, u.sd, u.low, u.high, None, u.log) for u in
-                 nominal_unknowns(chains, "arm") if u.name in final.values]
-        curves = shapes(chains, "arm", final, known)[0]
-        random = (gusts.follows_state(g.torque, columns) < RANDOM_TORQUE
-                  and curves.left - 1.0 > RANDOM_TORQUE * (curves.before - 1.0))
-        if g.gain > 0.0 and random:
-            values = {"gust.sigma": g.sigma, "gust.tau": g.tau}
-            sd = {"gust.sigma": g.sigma * g.sigma_sd, "gust.tau": g.tau * g.tau_sd}
-            torque = Weighed(Hypothesis("gust"), Fit(values, sd, {}, {}, {}, 0.0), g.gain, 1.0)
+    arm = findings["arm"]
+    torque = _chance(chains, arm.final)
+    if torque is not None and arm.found and chains.fit_nominal:
+        _beside_chance(chains, arm)
+        torque = _chance(chains, arm.final)
     if block == "actuator":
-        misfit, index = s.v_a - chain.actuator(own), np.arange(len(s))
+        misfit, index = s.v_a - chain.actuator(chains.own(arm.final.values, 0)), np.arange(len(s))
     elif block == "motor":
         misfit = s.i_a - chain.motor(chains.own(findings["motor"].base.values, 0))[0]
         index = np.arange(len(s))
     else:
-        g = fitted(chains.own(findings["arm"].base.values, 0))
+        g = _tracked(chains, arm.final, arm.base)
         misfit, index = g.torque, g.index
     rate = np.gradient(_calm(_angle(chains, s)), s.period)
     seen = _angle(chains, s) if chains.fit_nominal else s.theta
     variables: dict[str, Array] = {"theta": seen[index], "theta_dot": rate[index], "omega": chain.speed[index],
                  "i_a": s.i_a[index], "duty": s.duty[index], "t": np.asarray(index * s.period, dtype=float)}
     return torque, misfit[: len(index)], variables
+
+
+def _tracked(chains: Chains, arm: Fit, follow: Fit | None = None) -> gusts.Gust:
+    """The random torque that would do what a fit of the arm leaves; `follow`: what another one leaves."""
+    chain = chains.each[0]
+    s = chain.signals
+    n = with_values(chains.model, chains.own(arm.values, 0)).numbers()
+    left = (s.theta - chain.arm(chains.own((follow or arm).values, 0)))[: s.train]
+    return gusts.fit_gust(left, s.theta[: s.train], n["mgd_over_J"], n["c_over_J"], s.sigma["theta"], s.period)
+
+
+def _chance(chains: Chains, final: Fit) -> Weighed | None:
+    """`gust`, if what a fit of the arm leaves is a random torque: no state predicts it, and no free curve takes it."""
+    if final.scale.get("theta", 1.0) <= GOOD_ENOUGH:
+        return None
+    chain = chains.each[0]
+    s = chain.signals
+    g = _tracked(chains, final)
+    theta, speed = _angle(chains, s)[g.index], chain.speed[g.index]
+    rate = np.gradient(_calm(theta), g.index * s.period)
+    slope = np.gradient(speed, g.index * s.period)
+    columns = np.hstack([*(hats(x)[0] for x in (theta, rate, speed, slope)), (speed * rate)[:, None]])
+    known = [Unknown(u.name, u.mean, u.sd, u.low, u.high, None, u.log) for u in nominal_unknowns(chains, "arm")
+             if u.name in final.values]
+    curves = shapes(chains, "arm", final, known)[0]
+    if (g.gain <= 0.0 or gusts.follows_state(g.torque, columns) >= RANDOM_TORQUE
+            or curves.left - 1.0 <= RANDOM_TORQUE * (curves.before - 1.0)):
+        return None
+    values = {"gust.sigma": g.sigma, "gust.tau": g.tau}
+    sd = {"gust.sigma": g.sigma * g.sigma_sd, "gust.tau": g.tau * g.tau_sd}
+    return Weighed(Hypothesis("gust"), Fit(values, sd, {}, {}, {}, 0.0, {}), g.gain, 1.0)
+
+
+def _beside_chance(chains: Chains, arm: Findings) -> None:
+    """Take out what is not needed beside a random torque, the least needed first: chance looks like many an effect."""
+    all_ = _tracked(chains, arm.final)
+    while arm.found:
+        without = []
+        for round_ in arm.found:
+            h = round_[0].hypothesis
+            f = _refit(chains, "arm", [e for e in arm.effects if e is not h], arm.final.values)
+            g = _tracked(chains, f)
+            counts = counts_of([arm.final, f])
+            simpler = f.simplicity(counts) - arm.final.simplicity(counts)
+            without.append((all_.likelihood - g.likelihood - simpler + log_odds(h), round_, f, g))
+        gain, round_, f, g = min(without, key=lambda w: w[0])
+        if gain > 0.0:
+            break
+        arm.found.remove(round_)
+        arm.final, all_ = f, g
 
 
 def _angle(chains: Chains, s: Signals) -> Array:
@@ -559,8 +587,7 @@ def _checks(chains: Chains, findings: Mapping[str, Findings]) -> dict[str, Check
         own = {u.name for h in f.effects for u in h.starts[0]}
         known = [u for u in nominal_unknowns(chains, block) if u.name in f.final.values and u.name not in own]
         best = shapes(chains, block, f.final, known)[0]
-        chance = 3.0 * sum(len(c.value) for c in best.curves) / best.samples
-        left = max(best.before - best.left - chance * best.before, 0.0)
+        left = best.explained
         form = math.sqrt(left / max(_mean_square(f.base) - best.left, left, 1e-12))
         rms = {c: float(np.sqrt(np.mean(r * r))) for c, r in f.final.residuals.items()}
         white = {c: f.final.independent[c] / len(r) for c, r in f.final.residuals.items()}
@@ -593,8 +620,8 @@ def _weakest(model: Model, findings: Mapping[str, Findings], values: Mapping[str
     sure = []
     for block, f in findings.items():
         for round_ in f.found:
-            if fit_nominal and round_[0].gain > PLAIN and len(round_[0].hypothesis.starts[0]) > 1:
-                continue  # what it does is sure, only not which of its parameters does it
+            if fit_nominal and round_[0].gain > PLAIN:
+                continue  # what it does is sure, only not how much of it another of its parameters or a number does
             size = round_[0].hypothesis.starts[0][0].name
             spread = max(sd[size], NUMBER_SD * abs(model.model[size]) if size in model.model else 0.0)
             sure.append((abs(values[size] - _neutral(model, size)) / spread, block, round_))

@@ -19,6 +19,11 @@ from scipy.fft import irfft, next_fast_len, rfft
 Array = NDArray[np.float64]
 Residuals = Mapping[str, Array]
 """Channel -> residual in units of its standard deviation, missing samples left out."""
+Products = dict[str, tuple[NDArray[np.intp], Array]]
+"""Channel -> the unknowns (U,) that change it, and their slopes' products (U, U), summed over its samples."""
+
+STRAGGLERS = 0.1
+"""Share of the channels whose weights may still change when a fit ends: of many recordings there is always one."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,8 @@ class Fit:
         residuals: channel -> (N,) in units of the noise, at the estimate.
         scale: channel -> RMS of the residual, at least 1.
         independent: channel -> number of independent samples.
-        prior: log density of the estimate under the prior, less what the data's precision costs (Laplace).
+        prior: log density of the estimate under the prior.
+        slopes: products of the slopes of each channel.
     """
 
     values: dict[str, float]
@@ -74,14 +80,27 @@ class Fit:
     scale: dict[str, float]
     independent: dict[str, float]
     prior: float
+    slopes: Products
 
     def evidence(self, independent: Mapping[str, float]) -> float:
         """Log evidence of the hypothesis when a channel counts as so many independent samples."""
-        total = self.prior
+        return self.likelihood(independent) + self.simplicity(independent)
+
+    def likelihood(self, independent: Mapping[str, float]) -> float:
+        """What of the evidence is the misfit."""
+        total = 0.0
         for channel, r in self.residuals.items():
             s2 = self.scale[channel] ** 2
             total -= 0.5 * independent[channel] * (np.log(s2) + float(np.mean(r * r)) / s2)
         return total
+
+    def simplicity(self, independent: Mapping[str, float]) -> float:
+        """What of it is the prior, less what the data's precision costs (Laplace)."""
+        information = np.eye(len(self.values))
+        for channel, (by, products) in self.slopes.items():
+            weight = independent[channel] / len(self.residuals[channel]) / self.scale[channel] ** 2
+            information[np.ix_(by, by)] += weight * products
+        return self.prior - 0.5 * float(np.linalg.slogdet(information)[1])
 
 
 def independent_samples(r: Array, power: int = 1) -> float:
@@ -117,8 +136,9 @@ class Slopes:
 class Search:
     """A point in the space of the unknowns, in standard units, with its residuals and their weights."""
 
-    def __init__(self, residuals: Callable[[dict[str, float]], Residuals], unknowns: Sequence[Unknown]) -> None:
-        self.residuals, self.unknowns = residuals, tuple(unknowns)
+    def __init__(self, residuals: Callable[[dict[str, float]], Residuals], unknowns: Sequence[Unknown],
+                 least: float = 0.0) -> None:
+        self.residuals, self.unknowns, self.least = residuals, tuple(unknowns), least
         self.low = np.array([u.to_standard(u.low) for u in unknowns])
         self.high = np.array([u.to_standard(u.high) for u in unknowns])
         self.z = np.array([u.to_standard(u.mean if u.start is None else u.start) for u in unknowns])
@@ -135,7 +155,8 @@ class Search:
         """Inflate the noise and thin the samples to what the residuals at this point show."""
         self.scale = {k: max(1.0, float(np.sqrt(np.mean(r * r)))) for k, r in self.current.items()}
         self.independent = {k: independent_samples(r) for k, r in self.current.items()}
-        self.weight = {k: np.sqrt(self.independent[k] / len(r)) / self.scale[k] for k, r in self.current.items()}
+        self.weight = {k: np.sqrt(min(max(self.independent[k], self.least) / len(r), 1.0)) / self.scale[k]
+                       for k, r in self.current.items()}
 
     def stack(self, residuals: Residuals) -> Array:
         """Weighted residuals of all channels as one vector."""
@@ -172,21 +193,24 @@ class Search:
             at += s.rows.shape[1]
         return out
 
-    def normal(self, slopes: Mapping[str, Slopes]) -> tuple[Array, Array]:
-        """The information matrix and the gradient of half the cost, prior included."""
+    def normal(self, slopes: Mapping[str, Slopes]) -> tuple[Array, Array, Products]:
+        """The information matrix and the gradient of half the cost, prior included; and what `Fit.slopes` keeps."""
         information, gradient = np.eye(len(self.z)), self.z.copy()
+        products: dict[str, tuple[NDArray[np.intp], Array]] = {}
         for k, s in slopes.items():
-            information[np.ix_(s.by, s.by)] += s.rows @ s.rows.T
+            of_all = s.rows @ s.rows.T
+            information[np.ix_(s.by, s.by)] += of_all
             gradient[s.by] += s.rows @ (self.weight[k] * self.current[k])
-        return information, gradient
+            products[k] = (s.by, of_all / self.weight[k] ** 2)
+        return information, gradient, products
 
-    def improve(self, steps: int) -> Array:
-        """Levenberg-Marquardt steps with the weights as they are; returns the information matrix, prior included."""
+    def improve(self, steps: int) -> tuple[Array, Products]:
+        """Levenberg-Marquardt steps with the weights as they are; returns the last `normal` but for its gradient."""
         damping = 1e-3
-        information = np.eye(len(self.z))
+        information, products = np.eye(len(self.z)), Products()
         for _ in range(steps):
             r = self.stack(self.current)
-            information, gradient = self.normal(self.jacobian())
+            information, gradient, products = self.normal(self.jacobian())
             cost = float(r @ r + self.z @ self.z)
             gained = 0.0
             while damping < 1e6:
@@ -203,31 +227,32 @@ class Search:
                 damping *= 8.0
             if gained < 1e-2 + 1e-4 * max(cost - sum(self.independent.values()), 0.0):
                 break
-        return information
+        return information, products
 
 
 def fit(residuals: Callable[[dict[str, float]], Residuals], unknowns: Sequence[Unknown],
-        rounds: int = 10, steps: int = 4) -> Fit:
+        rounds: int = 10, steps: int = 4, least: float = 0.0) -> Fit:
     """Maximum a posteriori fit with the noise inflated to what the residual shows.
 
     Args:
         residuals: values by name -> residuals in units of the noise.
         unknowns: what is fitted.
         rounds: how often the weights are renewed at most; steps: Levenberg-Marquardt steps in each.
+        least: samples that a channel counts for at least while the search goes on. A slow drift, which is worth a few,
+            would not pull numbers and sizes from where a wide prior has its middle.
     """
-    search = Search(residuals, unknowns)
-    information = np.eye(len(search.z))
+    search = Search(residuals, unknowns, least)
+    information, products = np.eye(len(search.z)), Products()
     for _ in range(rounds):
-        information = search.improve(steps)
+        information, products = search.improve(steps)
         before = search.weight
         search.renew_weights()
-        if all(abs(search.weight[k] - before[k]) < 0.02 * before[k] for k in before):
+        if sum(abs(search.weight[k] - before[k]) >= 0.02 * before[k] for k in before) <= STRAGGLERS * len(before):
             break
     z, covariance = search.z, np.linalg.inv(information)
-    prior = -0.5 * float(z @ z) - 0.5 * float(np.linalg.slogdet(information)[1])
     values = {u.name: u.value(x) for u, x in zip(unknowns, z, strict=True)}
     sd = {u.name: abs(u.slope(x)) * float(np.sqrt(v)) for u, x, v in zip(unknowns, z, np.diag(covariance), strict=True)}
-    return Fit(values, sd, search.current, search.scale, search.independent, prior)
+    return Fit(values, sd, search.current, search.scale, search.independent, -0.5 * float(z @ z), products)
 
 
 def screen(residuals: Callable[[dict[str, float]], Residuals], base: Fit, known: Sequence[Unknown],
@@ -246,7 +271,7 @@ def screen(residuals: Callable[[dict[str, float]], Residuals], base: Fit, known:
     search = Search(residuals, [replace(u, start=base.values[u.name]) for u in known])
     r = search.stack(search.current)
     slopes = search.jacobian()
-    information, gradient = search.normal(slopes)
+    information, gradient, _ = search.normal(slopes)
     cost = float(r @ r + search.z @ search.z)
     left = []
     for group in additions:

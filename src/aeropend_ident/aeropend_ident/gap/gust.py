@@ -32,7 +32,7 @@ class Gust:
 
     Attributes:
         sigma: rad/s², and tau: s, estimates. sigma_sd: relative, and tau_sd: likewise, of their logarithms.
-        gain: log likelihood over no torque but inflated white noise.
+        likelihood: its logarithm. gain: the same over no torque but inflated white noise.
         torque: (M,) rad/s², smoothed, at `index` (M,) of the samples.
         whiteness: lag-one correlation of the filter's innovations.
     """
@@ -41,6 +41,7 @@ class Gust:
     tau: float
     sigma_sd: float
     tau_sd: float
+    likelihood: float
     gain: float
     torque: Array
     index: NDArray[np.int64]
@@ -161,8 +162,8 @@ def fit_gust(residual: Array, theta: Array, gravity: float, damping: float, nois
     _smooth(kept, stiffness, damping, h, math.exp(z[1]), torque)
     e = innovations
     whiteness = float(np.mean(e[1:] * e[:-1]) / max(float(np.mean(e * e)), 1e-300))
-    return Gust(math.exp(z[0]), math.exp(z[1]), width[0], width[1], -best.fun - without, torque.copy(), index,
-                whiteness)
+    return Gust(math.exp(z[0]), math.exp(z[1]), width[0], width[1], -best.fun, -best.fun - without, torque.copy(),
+                index, whiteness)
 
 
 def follows_state(torque: Array, columns: Array) -> float:

@@ -16,9 +16,10 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
-from aeropend_ident.gap.chain import BLOCKS, Chain, Chains
-from aeropend_ident.gap.fit import Fit, fit
+from aeropend_ident.gap.chain import BLOCKS, Chain, Chains, with_values
+from aeropend_ident.gap.fit import Fit, Unknown, fit
 from aeropend_ident.gap.signals import Signals
 from aeropend_ident.gap.thrift import ThriftyChains
 from aeropend_ident.gap.unknown_rig import resolution, turning_points
@@ -51,6 +52,13 @@ SETTLES = 0.1
 
 SCATTER, MINIMUM_FREEDOM = 1.3, 30
 """Factor by which a local scatter must exceed the noise of a reading to replace it, and degrees of freedom to tell."""
+
+SIZES = {"command_delay.delay": (0.01, 0.03, 0.09), "thrust_lag.tau": (0.03, 0.1, 0.3),
+         "thrust_exponent.n": (1.3, 1.65, 2.35, 2.7)}
+"""Sizes that the search begins with for effects which a curve and a lag from duty to lift take for other ones."""
+
+FOLLOWED = 2
+"""Of these sizes, how many are followed up."""
 
 HANGS = 0.1
 """rad: an arm that begins no farther from hanging than this is taken to begin with a rotor that stands."""
@@ -215,19 +223,25 @@ def _with_local_noise(chain: Chain, values: Mapping[str, float]) -> Signals:
     return replace(s, sigma={**s.sigma, "theta": seen}, notes=(*s.notes, said))
 
 
-def _drawn_out(model: Model, recordings: Sequence[Signals]) -> tuple[Model, Fit]:
-    """Fit over the beginning, then over more and more of the recordings."""
+def _drawn_out(model: Model, recordings: Sequence[Signals], *effect: Unknown) -> tuple[Model, Fit]:
+    """Fit over the beginning, then over more and more of the recordings; an effect's unknown along."""
     for share in SHARES:
         least = round(3.0 / recordings[0].period)
         part = [replace(s, train=min(max(round(share * s.train), least), s.train)) for s in recordings]
-        model, f = _fitted(model, part, ROUNDS)
+        model, f = _fitted(model, part, ROUNDS, *effect)
     return model, f
 
 
-def _fitted(model: Model, recordings: Sequence[Signals], rounds: int = 10) -> tuple[Model, Fit]:
+def _fitted(model: Model, recordings: Sequence[Signals], rounds: int = 10, *effect: Unknown) -> tuple[Model, Fit]:
     chains = ThriftyChains(model, recordings)
-    f = fit(chains.residuals("arm"), nominal_unknowns(chains, "arm"), rounds)
+    along = [replace(u, start=_value(model, u.name)) for u in effect]
+    f = fit(chains.residuals("arm"), [*nominal_unknowns(chains, "arm"), *along], rounds)
     return chains.each[0].valued(shared(f.values)), f
+
+
+def _value(model: Model, name: str) -> float:
+    effect, _, parameter = name.partition(".")
+    return model.effects[effect][parameter]
 
 
 def shared(values: Mapping[str, float]) -> dict[str, float]:
@@ -278,7 +292,33 @@ def _coarser(s: Signals) -> Signals:
 
 def _driven(model: Model, recordings: Sequence[Signals]) -> list[Model]:
     """The likeliest beginnings for a rig with command and angle alone."""
-    tests = [_WeakForm(s) for s in recordings]
+    found = _likely(model, recordings, [_WeakForm(s) for s in recordings])
+    # a quick rotor with a sluggish arm looks much like a sluggish rotor with a quick arm: each lag has its say
+    first = {lag: next((m for _, own, m in found if own == lag), None) for lag in LAGS}
+    return [m for m in first.values() if m is not None] or [model]
+
+
+def with_effect(model: Model, recordings: Sequence[Signals], effect: Unknown) -> dict[str, float]:
+    """Numbers, states and the size of an effect of `SIZES`, identified together: numbers found without it mislead.
+
+    Args:
+        model: as identified without the effect. recordings: with command and angle alone. effect: its unknown.
+    """
+    coarse = [_coarser(s) for s in recordings]
+    tests = [_WeakForm(s) for s in coarse]
+    likely = [found[0] for size in SIZES[effect.name]
+              if (found := _likely(with_values(model, {effect.name: size}), coarse, tests))]
+    likely.sort(key=lambda item: item[0])
+    fits = [_drawn_out(m, coarse, effect)[1] for *_, m in likely[:FOLLOWED]]
+    if not fits:
+        return {}
+    counts = {k: max(f.independent[k] for f in fits) for k in fits[0].independent}
+    return max(fits, key=lambda f: f.evidence(counts)).values
+
+
+def _likely(model: Model, recordings: Sequence[Signals], tests: Sequence[_WeakForm]
+            ) -> list[tuple[float, float, Model]]:
+    """Curves and lags, the likeliest first: sum of squares left, lag, model."""
     found = []
     for dead, bend, load, lag in product((0.0, 0.04, 0.12), (0.003, 0.08, 0.6), (0.02, 1.0, 4.0), LAGS):
         numbers = _curve(model.model, dead, bend, load, lag)
@@ -289,11 +329,8 @@ def _driven(model: Model, recordings: Sequence[Signals]) -> list[Model]:
             continue
         numbers = {**numbers, "mgd_over_J": min(gravity, 5e3), "c_over_J": min(max(damping, 0.05), 100.0),
                    "L_over_J": min(gain / numbers["k_thrust"], 1e5)}
-        found.append((left, (dead, bend, load, lag), replace(m, model=numbers)))
-    found.sort(key=lambda item: item[0])
-    # a quick rotor with a sluggish arm looks much like a sluggish rotor with a quick arm: each lag has its say
-    first = {lag: next((m for _, setting, m in found if setting[3] == lag), None) for lag in LAGS}
-    return [m for m in first.values() if m is not None] or [model]
+        found.append((left, lag, replace(m, model=numbers)))
+    return sorted(found, key=lambda item: item[0])
 
 
 def lift(model: Model, recordings: Sequence[Signals]) -> dict[str, object]:
@@ -333,14 +370,19 @@ def _curve(numbers: Mapping[str, float], dead: float, bend: float, load: float, 
 
 
 def _lift(model: Model, s: Signals) -> Array:
-    """Speed squared (N,) that the duty gives."""
+    """Thrust (N,) that the duty gives, over k_thrust: the speed squared, unless an effect of `SIZES` changes that."""
     n = model.numbers()
-    v = actuator.acting_voltage(n, s.duty, {}, s.period, before=float(s.duty[0]))
     hangs = abs(float(np.mean(s.theta[np.isfinite(s.theta)][:3]))) < HANGS
+    before = 0.0 if hangs else float(s.duty[0])
+    v = actuator.acting_voltage(n, s.duty, model.effects, s.period, before=before)
     state = dynamics.State(omega=0.0 if hangs else float(actuator.speed_at(n, v[0])))
     out = np.empty((3, len(v)))
     dynamics.run_motor(v, state, *dynamics.prepare(model.with_effects({}), s.period), out)
-    return np.maximum(out[1], 0.0) ** 2
+    pivot = dynamics.THRUST_PIVOT_SPEED
+    u = pivot**2 * (np.maximum(out[1], 0.0) / pivot) ** model.effects.get("thrust_exponent", {}).get("n", 2.0)
+    tau = model.effects.get("thrust_lag", {}).get("tau", 0.0)
+    keep = math.exp(-s.period / tau) if tau > 0.0 else 0.0
+    return lfilter([1.0 - keep], [1.0, -keep], u, zi=[keep * u[0]])[0] if keep else u
 
 
 class _WeakForm:

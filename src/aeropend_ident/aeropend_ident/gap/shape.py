@@ -75,6 +75,12 @@ class Shape:
     samples: int
     independent: float
 
+    @property
+    def explained(self) -> float:
+        """Mean square that the curves explain beyond what chance would let them."""
+        chance = 3.0 * sum(len(c.value) for c in self.curves) / self.samples
+        return max(self.before - self.left - chance * self.before, 0.0)
+
 
 def hats(x: Array, count: int = KNOTS, train: int | None = None) -> tuple[Array, Array]:
     """Piecewise linear basis (N, K) of a variable (N,), and its knots (K,) at quantiles of its first `train` values."""

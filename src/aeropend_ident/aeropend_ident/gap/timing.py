@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from aeropend_ident.gap.chain import DELAY, Chain, Chains
 from aeropend_ident.gap.fit import Unknown, fit
+from aeropend_ident.gap.hypotheses import MISMATCH_SD
 from aeropend_ident.gap.unknowns import initial_unknowns, number_unknowns
-from aeropend_ident.gap.which import MISMATCH_SD
 from aeropend_sim.parameters import Model
 
 Array = NDArray[np.float64]

@@ -95,7 +95,7 @@ def initial_unknowns(chains: Chains, block: str) -> list[Unknown]:
             first = float(s.omega[np.isfinite(s.omega)][0])
             unknowns.append(Unknown(f"initial.omega{suffix}", first, 10.0, 0.0, 2000.0))
         if block == "arm" and chains.fit_nominal:
-            unknowns += _state_of_arm(chains.model, s, suffix)
+            unknowns += state_of_arm(chains.model, s, suffix)
         elif block == "arm":
             start = float(np.mean(s.theta[np.isfinite(s.theta)][:10]))
             unknowns += [Unknown(f"initial.theta{suffix}", start, 0.1), Unknown(f"initial.theta_dot{suffix}", 0.0, 1.0)]
@@ -143,7 +143,7 @@ def _of_angle(model: Model, recordings: Sequence[Signals]) -> list[Unknown]:
             replace(log("J_m", 0.7), low=quickest), _filter(model)]
 
 
-def _state_of_arm(model: Model, s: Signals, suffix: str) -> list[Unknown]:
+def state_of_arm(model: Model, s: Signals, suffix: str) -> list[Unknown]:
     """The state of the arm at the first sample, from a parabola through the first readings, and that of the rotor."""
     known = np.flatnonzero(np.isfinite(s.theta))
     first = known[:max(6, int(np.searchsorted(known, known[0] + FIRST_LOOK / s.period)))]
