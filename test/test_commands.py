@@ -81,6 +81,8 @@ def completions(line: str) -> list[str]:
 
 @pytest.mark.parametrize(("line", "expected"), [
     ("plant --ros-args -p preset:=", ["bench", "thesis"]),
+    ("cascade --ros-args -p model:=CO", ["CONTRIBUTING.md"]),
+    ("cascade --ros-args -p model:=t", ["thesis", "test/", "tools/"]),
     ("tune feedback_linearization --mo", ["--model"]),
 ])
 def test_bash_completes_what_a_command_takes(line, expected):

@@ -30,7 +30,7 @@ from aeropend_control import wire
 from aeropend_control.laws import LAWS, GainError, Law, LawKind, TuningError
 from aeropend_control.supervisor import Supervisor
 from aeropend_sim import interface
-from aeropend_sim.parameters import ModelError, load
+from aeropend_sim.parameters import PRESETS, ModelError, load
 from aeropend_sim.realtime import go_before_other_programs
 from aeropend_sim.rig import Sample
 from aeropend_sim.ros import Diagnostics, Setting, Usage, UserError, overrides, read_settings, run, usage
@@ -54,7 +54,7 @@ def settings(kind: LawKind) -> dict[str, Setting]:
     unit = kind.reference_unit
     return {
         "model": Setting(
-            "bench", "preset (bench, thesis) or model file, augmented.yaml too, that the law is made for", path=True
+            "bench", "what the law is made for, a model file may be augmented.yaml too", choices=PRESETS, path=True
         ),
         "gains": Setting(
             TUNED, "gains that are not given: computed for the model, or a set by name", choices=(TUNED, *kind.presets)

@@ -160,7 +160,7 @@ class Setting:
     """A parameter of a node: what the user may give, and what is taken otherwise.
 
     The default's type is the parameter's type; a float also takes a YAML integer. Lists are lists of floats. What is
-    `live` may be set while the node runs, which then must listen to it. A `path` may name a file.
+    `live` may be set while the node runs, which then must listen to it. A `path` may name a file besides its choices.
     """
 
     default: bool | int | float | str | list[float]
@@ -176,7 +176,7 @@ class Setting:
         """What a shell may offer as its value."""
         if isinstance(self.default, bool):
             return ("true", "false")
-        return (str(self.default), *files(prefix)) if self.path else self.choices
+        return (*self.choices, *files(prefix)) if self.path else self.choices
 
     def check(self, name: str, value: object) -> Any:
         """Return the value in the setting's own type, or raise UserError."""
@@ -188,7 +188,7 @@ class Setting:
         if type(value) is not kind:
             wanted = {bool: "true or false", str: "text", list: "a list of numbers"}[kind]
             raise UserError(f"parameter {name} is {value!r}: give {wanted}")
-        if self.choices and value not in self.choices:
+        if self.choices and value not in self.choices and not self.path:
             raise UserError(f"parameter {name} is '{value}': give one of {', '.join(self.choices)}")
         return value
 
@@ -205,7 +205,7 @@ class Setting:
         text = f"[{self.unit}] {self.description}" if self.unit else self.description
         descriptor = ParameterDescriptor(description=text, read_only=not self.live)
         if self.choices:
-            descriptor.additional_constraints = "one of " + ", ".join(self.choices)
+            descriptor.additional_constraints = f"one of {', '.join(self.choices)}{', or a file' if self.path else ''}"
         if math.isfinite(self.low) and math.isfinite(self.high):
             if isinstance(self.default, float):
                 descriptor.floating_point_range = [FloatingPointRange(from_value=self.low, to_value=self.high)]
@@ -320,7 +320,7 @@ def usage(
     lines += ["       " + example for example in examples[1:]]
     lines += ["", "parameters (-p name:=value, or a ROS parameter file):"] if table else []
     for name, setting in table.items():
-        limits = ", ".join(setting.choices)
+        limits = ", ".join((*setting.choices, *["FILE"] * setting.path))
         if math.isfinite(setting.low) and math.isfinite(setting.high):
             limits = f"{setting.low:.12g}..{setting.high:.12g}"
         unit = f" {setting.unit}" if setting.unit else ""
