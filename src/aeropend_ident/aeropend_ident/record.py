@@ -119,7 +119,8 @@ class Tap:
         self.publishers = 0
         self._number: int | None = None  # of the last message, by its publisher's count
         self._skipped = 0
-        self._alone = False
+        self._alone = True  # nobody has been there yet, so whoever comes first is
+        self._heard_of = False
 
     def take(self) -> tuple[int, bytes] | None:
         """Take the next message: receive time (ns) and what was on the wire. None when there is none."""
@@ -140,12 +141,13 @@ class Tap:
 
         The interval after one has come or gone does not count either: it begins with what waits from both.
         """
-        alone = self.publishers == 1 and publishers <= 1
+        alone = publishers <= 1 and (self.publishers == 1 or not self._heard_of)
         if alone and self._alone:
             self.lost += self._skipped
         else:
             self._number = None
         self._skipped, self._alone = 0, alone
+        self._heard_of |= publishers > 0
         self.publishers = publishers
 
 

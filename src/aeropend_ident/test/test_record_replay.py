@@ -11,6 +11,7 @@ import pytest
 from rosbags.rosbag2 import Reader
 
 from aeropend_ident.bag import Bag
+from aeropend_ident.record import Tap
 from aeropend_ident.recording import read
 from aeropend_ident.replay import Plan
 
@@ -105,6 +106,40 @@ def samples(recording, start, count):
     np.testing.assert_array_equal(recording.i_a, (-rows / 8).astype(np.float32))
     np.testing.assert_array_equal(recording.duty, (rows % 64) / 64)
     assert (recording.lost, recording.duplicates) == (0, 0)
+
+
+class Told:
+    """A subscription of which each message is only its number."""
+
+    def __init__(self, numbers):
+        self.handle, self.numbers = self, list(numbers)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def take_message(self, *_):
+        return (b"", {"publication_sequence_number": self.numbers.pop(0), "received_timestamp": 1})
+
+
+@pytest.mark.parametrize(("looks", "lost"), [
+    ([(0, []), (1, [7, 8, 10]), (1, [11, 12])], 1),  # joined late, and missed one at once
+    ([(0, [7, 9]), (1, [10]), (1, [11])], 1),
+    ([(1, [1, 2]), (1, [3, 6]), (0, [9]), (0, [])], 2),  # what waits when it has gone may be another's
+    ([(1, [1, 2]), (2, [3, 500, 4]), (2, [501, 7]), (1, [502]), (1, [503, 504]), (1, [505, 507])], 1),
+    ([(2, [1, 500]), (2, [2, 501]), (1, [502]), (1, [503])], 0),
+    ([(1, [1, 2]), (0, []), (1, [700, 702]), (1, [703, 705])], 1)])  # fmt: skip
+def test_what_is_lost_is_told_by_the_numbers_of_one_publisher(looks, lost):
+    tap = Tap("joint_states", "sensor_msgs/msg/JointState")
+    for publishers, numbers in looks:
+        tap.count_publishers(publishers)
+        tap.subscription = Told(numbers)
+        for _ in numbers:
+            tap.take()
+    tap.count_publishers(tap.publishers)
+    assert tap.lost == lost
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
