@@ -90,12 +90,7 @@ def show(file: Path, folder: Path) -> None:
     document = history.full(folder)
     if document is None:
         raise ValueError(f"{folder} holds no full run: run make bench, without ARGS, first")
-    try:
-        file.write_text(readme.put(file.read_text(encoding="utf-8"), readme.table(document)), encoding="utf-8")
-    except OSError as error:
-        raise ValueError(f"{file}: {error.strerror}") from None
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from None
+    results.show(file, "bench", readme.table(document))
 
 
 def measured(names: list[str], quick: bool, console: Console) -> dict[str, object]:

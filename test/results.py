@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of long runs: on which machine, and written as JSON into a folder that stays out of git."""
+"""Results of long runs: on which machine, as JSON in a folder that stays out of git, and as a table in the README."""
 
 import json
 import os
@@ -45,3 +45,36 @@ def write(document: Mapping[str, object], folder: Path) -> Path:
     for one in path, folder / "latest.json":
         one.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     return path
+
+
+def marks(target: str) -> tuple[str, str]:
+    """The two lines of the README between which is the table of a `make` target."""
+    return f"<!-- make {target}: begin -->", f"<!-- make {target}: end -->"
+
+
+def show(file: Path, target: str, table: str) -> None:
+    """Write the table of a `make` target into a file that has its marks.
+
+    Raises:
+        ValueError: it cannot be read or written, or there is no place for the table; one line.
+    """
+    try:
+        file.write_text(put(file.read_text(encoding="utf-8"), target, table), encoding="utf-8")
+    except OSError as error:
+        raise ValueError(f"{file}: {error.strerror}") from None
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+
+
+def put(text: str, target: str, table: str) -> str:
+    """A text with something else between the marks of a `make` target.
+
+    Raises:
+        ValueError: the two are not there, once each and in this order.
+    """
+    begins, ends = marks(target)
+    head, begin, rest = text.partition(begins)
+    _, end, tail = rest.partition(ends)
+    if not begin or not end or begins in rest or ends in head + tail:
+        raise ValueError(f"the lines '{begins}' and '{ends}' must be in it, once each and in this order")
+    return f"{head}{begins}\n{table}\n{ends}{tail}"

@@ -13,11 +13,12 @@ import results
 from benchmarks import growth, history, readme
 from benchmarks.measure import Figure, Spread, Target
 
-from aeropend_ident.gap.which import hypotheses
+from aeropend_ident.gap.hypotheses import hypotheses
 from aeropend_sim.parameters import load
 
 MACHINE = {"cpu": "one", "cores": 2, "python": "3.12.1", "numba": "1.0", "commit": "abc"}
 HERE = Path(__file__).parent
+BEGIN, END = results.marks("bench")
 
 
 def figure(median, q1=None, q3=None, name="reading", target=None, **more):
@@ -83,15 +84,15 @@ class TestReadme:
     def test_a_copy_of_the_readme_changes_between_the_marks_only(self, tmp_path):
         results.write(document(figure(0.1, main=True)), tmp_path)
         copy = tmp_path / "README.md"
-        whole = (HERE.parent / "README.md").read_text().replace(readme.BEGIN, "").replace(readme.END, "")
-        copy.write_text(f"{whole}\n{readme.BEGIN}\nold\n{readme.END}\nrest\n")
+        whole = (HERE.parent / "README.md").read_text().replace(BEGIN, "").replace(END, "")
+        copy.write_text(f"{whole}\n{BEGIN}\nold\n{END}\nrest\n")
         for _ in range(2):
             assert bench.main(["--readme", str(copy)], tmp_path) == 0
             table = readme.table(history.full(tmp_path))
-            assert copy.read_text() == f"{whole}\n{readme.BEGIN}\n{table}\n{readme.END}\nrest\n"
+            assert copy.read_text() == f"{whole}\n{BEGIN}\n{table}\n{END}\nrest\n"
 
     @pytest.mark.parametrize("text", [
-        "no marks", readme.BEGIN, f"{readme.END} {readme.BEGIN}", f"{readme.BEGIN} {readme.BEGIN} {readme.END}"])
+        "no marks", BEGIN, f"{END} {BEGIN}", f"{BEGIN} {BEGIN} {END}"])
     def test_without_its_marks_it_stays_as_it_is(self, tmp_path, capsys, text):
         results.write(document(figure(0.1, main=True)), tmp_path)
         (tmp_path / "copy.md").write_text(text)

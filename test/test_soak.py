@@ -1,19 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """`make soak`, short: a loop under load, the faults that no other test has, the command itself, and how it judges."""
 
+import json
 import signal
 import subprocess
 import sys
 import time
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
+import results
 from graph import PATIENCE_S
-from soak.__main__ import main
+from soak.__main__ import MINUTES, into_readme, main
 from soak.faults import FAULTS
-from soak.stand import PERIOD_NS, Clock, Stand, holes, missing
+from soak.stand import PERIOD_NS, Clock, Promise, Stand, holes, missing
 from soak.steady import WARM_UP_S, Growth, busy, steady
 
 SECONDS = 12.0
@@ -98,6 +101,27 @@ def test_a_wrong_command_line_ends_in_one_line_and_exit_code_2(monkeypatch, caps
     assert expected in line
 
 
+def test_the_table_of_the_last_whole_run_goes_into_a_readme(tmp_path):
+    begin, end = results.marks("soak")
+    file = tmp_path / "README.md"
+    file.write_text(f"before\n{begin}\nold\n{end}\nafter\n")
+    with pytest.raises(ValueError, match="run make soak"):
+        into_readme(file, tmp_path)
+    kept = [Promise("steady", "plant", "lost ticks: none", True, "0 of 9"),
+            *(Promise("unplug", "bridge", what, what == "a | b", "found") for what in ("a | b", "c"))]  # fmt: skip
+    whole = {"format": 1, "full": True, "date": "2026-01-02", "minutes": MINUTES, "seed": 1, "load_before": [0.2],
+             "machine": {"cpu": "one", "cores": 2, "python": "3.12", "commit": "abc"},
+             "promises": [asdict(one) for one in kept], "broken": [asdict(kept[-1])]}  # fmt: skip
+    for name, change in (("1", {"date": "2026-01-01"}), ("2", {}), ("3", {"full": False})):
+        (tmp_path / f"{name}.json").write_text(json.dumps({**whole, **change}))
+    into_readme(file, tmp_path)
+    lines = file.read_text().splitlines()
+    assert lines[:2] + lines[-2:] == ["before", begin, end, "after"]
+    assert "| steady | plant | lost ticks: none | yes | 0 of 9 |" in lines
+    assert f"| unplug | bridge | {FAULTS['unplug'].promise} | **no** | c: found |" in lines
+    assert "2026-01-02, commit abc, load 0.2 at the start: 3 checks, 1 broken." in lines[-3]
+
+
 GRID = 10**18 + PERIOD_NS * np.arange(1000)
 
 
@@ -119,6 +143,9 @@ def test_missing_is_what_was_heard_and_is_not_in_the_bag():
     two = np.where(np.arange(len(GRID)) < 500, 0, 1)
     assert missing(GRID, two, np.delete(GRID, slice(500, 550))) == 0
     assert missing(GRID, one, np.delete(GRID, slice(500, 550))) == 50
+    # and the last words of the one before may be lost with it
+    assert missing(GRID, two, np.delete(GRID, slice(490, 550))) == 0
+    assert missing(GRID, two, np.delete(GRID, [480, 600])) == 2
 
 
 @pytest.mark.parametrize("rate", [0.0, 30.0])

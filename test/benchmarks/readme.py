@@ -6,9 +6,6 @@ from typing import Any
 
 from benchmarks.measure import number
 
-BEGIN, END = "<!-- make bench: begin -->", "<!-- make bench: end -->"
-"""Between these two lines of the README is the table."""
-
 
 def _cell(spread: Mapping[str, float] | None, unit: str) -> str:
     if not spread:
@@ -35,15 +32,3 @@ def table(document: Mapping[str, Any]) -> str:
     missed = [*document["missed"], *document["not_measured"]]
     return "\n".join([*lines, "", said + (f"; not: {'; '.join(missed)}." if missed else ".")])
 
-
-def put(text: str, new: str) -> str:
-    """A text with something else between `BEGIN` and `END`.
-
-    Raises:
-        ValueError: the two are not there, once each and in this order.
-    """
-    head, begin, rest = text.partition(BEGIN)
-    _, end, tail = rest.partition(END)
-    if not begin or not end or BEGIN in rest or END in head + tail:
-        raise ValueError(f"the lines '{BEGIN}' and '{END}' must be in it, once each and in this order")
-    return f"{head}{BEGIN}\n{new}\n{END}{tail}"

@@ -15,16 +15,18 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
+import results
+from benchmarks import history
 from graph import Graph, isolate
 from rclpy.signals import uninstall_signal_handlers
-from results import ROOT, machine, write
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -34,13 +36,16 @@ from soak.faults import FAULTS
 from soak.stand import RIGS, BrokenError, Clock, Promise, Stand
 from soak.steady import Growth, busy, steady
 
-RESULTS = ROOT / "soak-results"
+RESULTS = results.ROOT / "soak-results"
+MINUTES = 30.0
 EXAMPLES = """examples:
   make soak
   make soak ARGS="--minutes 5 --seed 3"
   make soak ARGS="--minutes 2 --faults kill stop clock"
+  make soak ARGS=--readme              the table of the last whole run goes into README.md
 
-exit codes: 0 every promise was kept, 1 one was broken, 2 a wrong command line, 130 interrupted"""
+exit codes: 0 every promise was kept, 1 one was broken, 2 a wrong command line, or no results for the
+README, 130 interrupted"""
 
 Say = Callable[[str], None]
 
@@ -105,24 +110,19 @@ def _folder(parent: Path, *names: str) -> Path:
     return folder
 
 
-def table(promises: list[Promise]) -> Table:
+def lines(promises: list[Promise]) -> list[Promise]:
     """What was kept, in a line a promise of the steady half and a line a fault."""
-    shown = Table("part", "rig", "promise", "kept", "found", show_lines=True)
+    found: list[Promise] = []
     for part in dict.fromkeys(one.part for one in promises):
         for rig in RIGS:
             ours = [one for one in promises if (one.part, one.rig) == (part, rig)]
             if part in FAULTS and ours:
-                ours = [_whole(part, rig, ours)]
+                ours = [_sum(FAULTS[part].promise, part, rig, ours)]
             elif part in ("start", "end") and ours:
                 ours = [_sum("a loop starts" if part == "start" else "Ctrl-C ends all: duty 0, exit code 0, whole bags",
                              part, rig, ours)]
-            for one in ours:
-                shown.add_row(part, rig, escape(one.what), "[green]yes" if one.held else "[red]NO", escape(one.found))
-    return shown
-
-
-def _whole(part: str, rig: str, ours: list[Promise]) -> Promise:
-    return _sum(FAULTS[part].promise, part, rig, ours)
+            found += ours
+    return found
 
 
 def _sum(what: str, part: str, rig: str, ours: list[Promise]) -> Promise:
@@ -131,16 +131,57 @@ def _sum(what: str, part: str, rig: str, ours: list[Promise]) -> Promise:
     return Promise(part, rig, what, not broken, "; ".join(broken) or f"{len(ours)} checks")
 
 
+def table(promises: list[Promise]) -> Table:
+    """What was kept, for people at a terminal."""
+    shown = Table("part", "rig", "promise", "kept", "found", show_lines=True)
+    for one in lines(promises):
+        shown.add_row(one.part, one.rig, escape(one.what), "[green]yes" if one.held else "[red]NO", escape(one.found))
+    return shown
+
+
+def readme(document: Mapping[str, Any]) -> str:
+    """What was kept as Markdown, and on which machine, when and of what it was tried."""
+    rows = ["| part | rig | promise | kept | found |", "| --- | --- | --- | --- | --- |"]
+    for one in lines([Promise(**row) for row in document["promises"]]):
+        cells = (one.part.replace("_", " "), one.rig, one.what, "yes" if one.held else "**no**", one.found)
+        rows.append("| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |")
+    of, broken = document["machine"], len(document["broken"])
+    said = (f"{document['minutes']:g} minutes with seed {document['seed']} on {of['cpu']}, {of['cores']} cores, Python "
+            f"{of['python']}, {document['date'][:10]}, commit {of['commit']}, load {document['load_before'][0]:.1f} at "
+            f"the start: {len(document['promises'])} checks, {f'{broken} broken' if broken else 'all kept'}.")
+    return "\n".join([*rows, "", said])
+
+
+def into_readme(file: Path, folder: Path) -> None:
+    """Write the table of the last whole run into a README.
+
+    Raises:
+        ValueError: there is no such run, or no place for the table; one line.
+    """
+    document = history.full(folder)
+    if document is None:
+        raise ValueError(f"{folder} holds no whole run: run make soak, without ARGS, first")
+    results.show(file, "soak", readme(document))
+
+
 def main() -> int:
     """Run what the command line asks for."""
     parser = Parser(prog="soak", description=(__doc__ or "").partition("\n")[0], epilog=EXAMPLES,
                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=30.0, help="how long in all, default 30")
+    parser.add_argument("--minutes", type=float, default=MINUTES, help=f"how long in all, default {MINUTES:g}")
     parser.add_argument("--seed", type=int, default=1, help="of the order of faults and all that is drawn, default 1")
     parser.add_argument("--faults", nargs="*", default=["all"], metavar="FAULT",
                         help="only those that have this in their names; none: steady work only. "
                         + ", ".join(FAULTS))
+    parser.add_argument("--readme", nargs="?", type=Path, const=results.ROOT / "README.md", metavar="FILE",
+                        help="run nothing, write the table of the last whole run into FILE (default: README.md)")
     options = parser.parse_args()
+    if options.readme is not None:
+        try:
+            into_readme(options.readme, RESULTS)
+        except ValueError as error:
+            parser.error(str(error))
+        return 0
     if not 0.1 <= options.minutes <= 1e5:
         parser.error("--minutes: give 0.1 or more")
     wanted = [] if options.faults == ["all"] else options.faults
@@ -175,12 +216,13 @@ def main() -> int:
     broken = [one for one in promises if not one.held]
     document = {
         "format": 1, "date": datetime.now(timezone.utc).isoformat(timespec="seconds"), "minutes": options.minutes,
+        "full": options.minutes >= MINUTES and len(names) == len(FAULTS),
         "seed": options.seed, "faults": names, "seconds": round(time.monotonic() - begun, 1),
-        "machine": machine(("ros-jazzy-rclpy", "rosbags", "numpy")),
+        "machine": results.machine(("ros-jazzy-rclpy", "rosbags", "numpy")),
         "load_before": load, "load_after": os.getloadavg(), "growth": growth,
         "promises": [asdict(one) for one in promises], "broken": [asdict(one) for one in broken],
     }
-    path = write(document, RESULTS)
+    path = results.write(document, RESULTS)
     console.print(table(promises))
     console.print(f"{len(promises)} checks in {document['seconds']:.0f} s, "
                   + (f"[red]{len(broken)} broken" if broken else "[green]all kept")

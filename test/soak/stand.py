@@ -391,7 +391,8 @@ def holes(stamps: Stamps) -> int:
 def missing(heard: Stamps, publisher: Stamps, there: Stamps) -> int:
     """Samples heard up to the last of a bag that are not in it.
 
-    What came before the bag's first sample of a publisher does not count: the recorder did not know it yet.
+    What came before the bag's first sample of a publisher does not count: the recorder did not know it yet. Nor does
+    what came after its last: a publisher that ends does not wait until everybody has what it said.
 
     Args:
         heard: (N,) stamps. publisher: (N,) a number of who sent them. there: (M,) stamps of the bag.
@@ -402,5 +403,7 @@ def missing(heard: Stamps, publisher: Stamps, there: Stamps) -> int:
     count = 0
     for one in np.unique(publisher):
         mine = known[publisher == one]
+        if one != publisher[-1]:  # it has ended
+            mine = mine[: len(mine) - mine[::-1].argmax()]
         count += int((~mine[mine.argmax():]).sum())
     return count
