@@ -223,20 +223,20 @@ def test_the_motor_stops_when_the_host_is_killed(graph, tmp_path):
     rig = Rig(graph, tmp_path, *away("killed"))
     try:
         with graph.talking(Float64, f"/killed/{DUTY_COMMAND}") as send:
-            graph.until(lambda: send(Float64(data=0.5)) or rig.board.duty == 128, "the duty")
-        for number in (signal.SIGSTOP, signal.SIGKILL):
-            rig.bridge.send(number)
-            sent = time.monotonic_ns()
-            graph.until(lambda: rig.board.duty == 0, "duty 0")
-            if number == signal.SIGSTOP:
-                stopped = rig.board.applied[-1][0] - sent
-                rig.bridge.send(signal.SIGCONT)
-                rig.bridge.wait_for("duty 0 until the next command")
-                assert rig.board.duty == 0
-                with graph.talking(Float64, f"/killed/{DUTY_COMMAND}") as send:
-                    graph.until(lambda: send(Float64(data=0.5)) or rig.board.duty == 128, "the duty of a new command")
-        assert stopped < 0.12e9
-        assert rig.board.applied[-1][0] - sent < 0.12e9
+            for number in (signal.SIGSTOP, signal.SIGKILL):
+                graph.until(lambda: send(Float64(data=0.5)) or rig.board.duty == 128, "the duty")
+                rig.bridge.send(number)
+                sent = time.monotonic_ns()
+                graph.until(lambda: rig.board.duty == 0, "duty 0")
+                assert rig.board.applied[-1][0] - sent < 0.12e9
+                if number == signal.SIGSTOP:
+                    for _ in range(5):  # these wait while it stands still
+                        send(Float64(data=0.5))
+                    heard = len(rig.board.commands)
+                    rig.bridge.send(signal.SIGCONT)
+                    rig.bridge.wait_for("duty 0 until the next command")
+                    graph.until(lambda: len(rig.board.commands) > heard + 5, "the duty's repetitions")
+                    assert rig.board.duty == 0
     finally:
         rig.close()
 

@@ -8,7 +8,7 @@ is a gap in the stamps, and counted.
 The board sets the duty to 0 when it hears nothing for 100 ms. The simulated plant holds the last `duty_command`; so
 that both behave alike, the node repeats the present duty every `REPEAT_S`. It does so from the executor: when the node
 ends, hangs or loses its port, the motor stops. After the port was lost, the board was reset, or the node stood still,
-the duty is 0 until the next command.
+the duty is 0 until the next command. What was sent while the node stood still is no such command.
 
 One thread reads the port and publishes. Commands go out from the executor's callbacks, at once or not at all.
 """
@@ -88,6 +88,7 @@ class Bridge(Node):
         self._sequence = 0
         self._enabled = True
         self._settings_sent = self._commanded = 0.0
+        self._deaf_until = -math.inf
         self._hello: Hello | None = None
         self._asked = -math.inf
         self._doubted: int | None = None
@@ -98,7 +99,7 @@ class Bridge(Node):
             ("samples", "lost samples", "bad frames", "refused commands", "dropped writes", "reconnects",
              "board resets", "gaps", "clock steps", "samples without command", "receive errors on the board",
              "speed pulses rejected", "angles with errors", "commands without board",
-             "commands refused by the board", "stalls"), 0
+             "commands refused by the board", "stalls", "commands of a stall"), 0
         )  # fmt: skip
         self._gap_max = 0.0
         self._stamp = 0
@@ -281,20 +282,32 @@ class Bridge(Node):
         with self._lock:
             if self._hello is None:
                 self._counts["commands without board"] += 1
+            elif self._rests_after_stall():
+                self._counts["commands of a stall"] += 1
             elif self._enabled:
                 self._duty = duty
                 self._command()
+
+    def _rests_after_stall(self) -> bool:
+        """Set the duty to 0 when this node stood still, and tell whether a command may be from before.
+
+        The board stopped the motor meanwhile: it must not start again by a command that waited in the middleware.
+        """
+        now = time.monotonic()
+        since = now - self._commanded
+        if since > protocol.COMMAND_TIMEOUT_S and self._duty > 0.0:
+            self._counts["stalls"] += 1
+            self.get_logger().warn(f"stood still for {since:.2f} s: duty 0 until the next command")
+            self._duty = 0.0
+            self._deaf_until = now + REPEAT_S
+        return now < self._deaf_until
 
     def _on_repeat(self) -> None:
         with self._lock:
             if self._hello is None:
                 return
-            since = time.monotonic() - self._commanded
-            if since > protocol.COMMAND_TIMEOUT_S and self._duty > 0.0:  # the board has stopped the motor: so it stays
-                self._counts["stalls"] += 1
-                self.get_logger().warn(f"stood still for {since:.2f} s: duty 0 until the next command")
-                self._duty = 0.0
-            if since > 0.5 * REPEAT_S:
+            self._rests_after_stall()
+            if time.monotonic() - self._commanded > 0.5 * REPEAT_S:
                 self._command()
             if self._last is not None and time.monotonic() - self._settings_sent > RETRY_S:
                 flags = self._last.flags
