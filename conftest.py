@@ -1,13 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tells the tests that run nodes from those that only compute: the latter may share the machine (`make test`)."""
 
-import os
-
 import pytest
-
-# A node that is killed, as some are here, can leave locks in shared memory on which the next one waits for ever
-# (Fast DDS issue 1144).
-os.environ["FASTDDS_BUILTIN_TRANSPORTS"] = "UDPv4"
 
 RUN_NODES = {"graph", "processes", "start"}
 """The fixtures of tests whose nodes need the machine to themselves."""

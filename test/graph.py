@@ -19,6 +19,7 @@ from rclpy.node import Node
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from aeropend_sim import interface
+from aeropend_sim.transport import without_shared_memory
 
 MODULES = {
     "plant": "aeropend_sim.plant",
@@ -134,6 +135,7 @@ class Graph:
     """The tests' own node."""
 
     def __init__(self) -> None:
+        without_shared_memory()
         rclpy.init(args=[])
         self.node = Node("test")
         self._executor = EventsExecutor()

@@ -235,7 +235,7 @@ def test_the_motor_stops_when_the_host_is_killed(graph, tmp_path):
                     heard = len(rig.board.commands)
                     rig.bridge.send(signal.SIGCONT)
                     rig.bridge.wait_for("duty 0 until the next command")
-                    graph.until(lambda: len(rig.board.commands) > heard + 5, "the duty's repetitions")
+                    graph.until(lambda heard=heard: len(rig.board.commands) > heard + 5, "the duty's repetitions")
                     assert rig.board.duty == 0
     finally:
         rig.close()

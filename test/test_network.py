@@ -21,6 +21,7 @@ from std_srvs.srv import SetBool
 from aeropend_ident.record import TOPICS
 from aeropend_sim import interface
 from aeropend_sim.interface import ARMATURE, DUTY_COMMAND, ENABLE, JOINT_STATES, REFERENCE
+from aeropend_sim.transport import LOCALHOST, PROFILES, RANGE, TRANSPORTS, without_shared_memory
 
 ROOT = Path(__file__).parents[1]
 PEOPLE = {"operator", "viewer"}
@@ -135,6 +136,42 @@ def test_make_keeps_to_this_machine_unless_told_otherwise(given, expected):
     result = subprocess.run(["make", "-s", f"--eval={recipe}", "_range"], cwd=ROOT, env=environment,
                             capture_output=True, text=True, check=True)
     assert result.stdout.strip() == expected
+
+
+SHARED = {RANGE: "LOCALHOST", TRANSPORTS: "DEFAULT"}
+
+
+@pytest.mark.parametrize(("given", "expected"), [
+    ({}, {TRANSPORTS: "UDPv4"}),
+    ({RANGE: "SUBNET"}, {RANGE: "SUBNET", TRANSPORTS: "UDPv4"}),
+    ({RANGE: "LOCALHOST"}, {RANGE: "SUBNET", PROFILES: str(LOCALHOST)}),
+    ({RANGE: "LOCALHOST", TRANSPORTS: "UDPv4"}, {RANGE: "SUBNET", PROFILES: str(LOCALHOST)}),
+    ({RANGE: "LOCALHOST", PROFILES: "mine.xml"}, {RANGE: "LOCALHOST", PROFILES: "mine.xml"}),
+    (SHARED, SHARED),
+])
+def test_messages_go_by_udp_unless_somebody_chose(given, expected):
+    for _ in range(2):  # a process it starts does it once more
+        without_shared_memory(given := dict(given))
+        assert given == expected
+
+
+def threads(process):
+    """The names of the threads of a process."""
+    return {(folder / "comm").read_text().strip() for folder in Path(f"/proc/{process.popen.pid}/task").iterdir()}
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_node_has_no_shared_memory_hears_no_multicast_and_is_heard_by_all(graph, start, monkeypatch, shared):
+    """Multicast comes at port 7400 + 250 per domain."""
+    for name in (PROFILES, TRANSPORTS):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in (SHARED if shared else {RANGE: "LOCALHOST"}).items():
+        monkeypatch.setenv(name, value)
+    plant = start("plant", "--ros-args", "-r", "__ns:=/transported")
+    with graph.listening(JointState, f"/transported/{JOINT_STATES}") as heard:
+        graph.until(lambda: len(heard) > 100, "samples")
+    assert any(name.startswith("dds.shm") for name in threads(plant)) == shared
+    assert f"dds.udp.{7400 + 250 * int(os.environ['ROS_DOMAIN_ID'])}" not in threads(plant)
 
 
 RIG = ["-r", f"{JOINT_STATES}:=/strange/{JOINT_STATES}", "-r", f"{ARMATURE}:=/strange/{ARMATURE}"]

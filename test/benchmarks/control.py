@@ -17,6 +17,7 @@ from aeropend_control import wire
 from aeropend_control.laws import LAWS
 from aeropend_sim import interface
 from aeropend_sim.parameters import SAMPLE_PERIOD
+from aeropend_sim.transport import without_shared_memory
 from benchmarks import measure
 from benchmarks.measure import Figure, NotMeasuredError, Spread, Target
 from benchmarks.nodes import NAMESPACE, PEER_S, SETTLE_S, Process
@@ -33,6 +34,7 @@ class Wiretap:
     """Hears samples and commands as the plant does: a command's time is when it came here."""
 
     def __init__(self) -> None:
+        without_shared_memory()
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         self._node = Node("benchmark", namespace=NAMESPACE)
         qos = QoSProfile(reliability=interface.QOS.reliability, history=interface.QOS.history, depth=5000)

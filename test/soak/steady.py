@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The first half: nothing happens but work, for long, beside another program that wants a core."""
 
-import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.stats import linregress, t
+from sleeper import Sleeper
 
 from soak.stand import Stand
 
@@ -30,25 +29,6 @@ LATE, AS_LATE = 1e-3, 2.0
 only sleeps, on a machine that lets nobody be in time."""
 GROWTH_MIB_H = {"rig": 2.0, "controller": 2.0, "recorder": 10.0, "board": 2.0}
 """MiB/h that may surely be exceeded by none. `record` keeps an index of its bag."""
-
-
-class Sleeper:
-    """Runs `soak.sleeper`."""
-
-    def __enter__(self) -> "Sleeper":
-        self._program = subprocess.Popen([sys.executable, "-m", "soak.sleeper"], stdout=subprocess.PIPE, text=True,
-                                         cwd=Path(__file__).parents[1])  # fmt: skip
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._program.kill()
-        self._program.wait()
-
-    def ended(self) -> dict[str, int]:
-        """End it; returns its late ticks and lost ticks."""
-        self._program.send_signal(signal.SIGINT)
-        said, _ = self._program.communicate()
-        return dict(zip(("late ticks", "lost ticks"), map(int, said.split()), strict=True))
 
 
 @dataclass(frozen=True)

@@ -26,11 +26,13 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Float64
 from aeropend_sim import interface
+from aeropend_sim.transport import without_shared_memory
 
 count, namespace = int(sys.argv[1]), sys.argv[2]
 qos = interface.QOS
 if "best_effort" in sys.argv:
     qos = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+without_shared_memory()
 rclpy.init()
 node = rclpy.create_node("feed", namespace=namespace)
 joints = node.create_publisher(JointState, interface.JOINT_STATES, qos)

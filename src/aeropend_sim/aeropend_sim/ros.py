@@ -44,6 +44,7 @@ from rclpy.utilities import remove_ros_args
 
 from aeropend_sim import interface
 from aeropend_sim.command import Parser, asked_to_complete, files
+from aeropend_sim.transport import without_shared_memory
 from aeropend_sim.untrusted import check_yaml, one_line
 
 RCLError = rclpy_implementation.RCLError
@@ -405,6 +406,7 @@ def _words(argv: list[str]) -> list[str]:
 def _init(argv: list[str]) -> None:
     """Start rclpy, with its complaints about the command line as one UserError."""
     rclpy.logging.set_logger_level("rcl", rclpy.logging.LoggingSeverity.FATAL)  # the UserError says it already
+    without_shared_memory()
     try:
         rclpy.init(args=["node", *argv], signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:
