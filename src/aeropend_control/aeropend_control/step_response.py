@@ -79,7 +79,7 @@ def step_responses(time: ArrayLike, y: ArrayLike, reference: ArrayLike, smoothin
     edges = [0, *(np.flatnonzero(np.diff(reference)) + 1).tolist(), len(y)]
     described, before = [], float(smooth[0])
     for a, b in pairwise(edges):
-        if a > 0 or abs(reference[0] - before) > RESOLVED * noise:
+        if a > 0 or not math.isclose(reference[0], before, abs_tol=RESOLVED * noise):
             described.append(_describe(time[a:b], smooth[a:b], float(reference[a]), before, noise))
         before = _final(smooth[a:b])
     if not described:
