@@ -3,7 +3,6 @@
 
 import json
 import math
-import signal
 import subprocess
 import sys
 import time
@@ -22,17 +21,6 @@ NAMESPACE = "/rig"
 EFFECT, PLACE = "coulomb_friction", "arm"
 RECORDED_S = 30.0
 LAWS = ("feedback_linearization_cascade",)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def recorded(graph, tmp_path_factory):
-    """A third rig, with an effect withheld, is recorded while the other tests run: its process, and the bag."""
-    bag = tmp_path_factory.mktemp("swap") / "bag"
-    recorder = subprocess.Popen([sys.executable, swap.__file__, "record", bag, str(RECORDED_S), EFFECT])
-    yield recorder, bag
-    if recorder.poll() is None:
-        recorder.send_signal(signal.SIGINT)
-        recorder.wait()
 
 
 def endpoints(graph, node):
@@ -156,9 +144,10 @@ def test_a_law_steps_both_rigs_alike(graph, tmp_path, law):
         assert ratios[metric] == pytest.approx(1.0, abs=0.1), metric
 
 
-def test_a_withheld_effect_is_found_from_a_recording_through_the_bridge(recorded, tmp_path):
-    recorder, bag = recorded
-    assert recorder.wait(120.0) == 0
+@pytest.mark.alone
+def test_a_withheld_effect_is_found_from_a_recording_through_the_bridge(tmp_path):
+    bag = tmp_path / "bag"
+    subprocess.run([sys.executable, swap.__file__, "record", bag, str(RECORDED_S), EFFECT], check=True, timeout=120)
     with Process("diagnose", str(bag), "--out", str(tmp_path)) as diagnose:
         assert diagnose.wait(120.0) == 0, diagnose.output
     body = json.loads((tmp_path / "diagnosis.json").read_text())
