@@ -81,18 +81,6 @@ def table(figures: list[Figure]) -> Table:
     return shown
 
 
-def show(file: Path, folder: Path) -> None:
-    """Write the table of the last full run into a README.
-
-    Raises:
-        ValueError: there is no such run, or no place for the table; one line.
-    """
-    document = history.full(folder)
-    if document is None:
-        raise ValueError(f"{folder} holds no full run: run make bench, without ARGS, first")
-    results.show(file, "bench", readme.table(document))
-
-
 def measured(names: list[str], quick: bool, console: Console) -> dict[str, object]:
     """Measure, show, and return what is to be written."""
     figures: list[Figure] = []
@@ -129,12 +117,11 @@ def main(arguments: list[str] | None = None, folder: Path = RESULTS) -> int:
     parser.add_argument("--quick", action="store_true", help="shorter and with fewer repeats: a fifth of the time")
     parser.add_argument("--only", nargs="+", choices=FIGURES, metavar="FIGURE", default=list(FIGURES),
                         help=f"measure only these: {', '.join(FIGURES)}")
-    parser.add_argument("--readme", nargs="?", type=Path, const=results.ROOT / "README.md", metavar="FILE",
-                        help="measure nothing, write the table of the last full run into FILE (default: README.md)")
+    results.offer_readme(parser)
     options = parser.parse_args(arguments)
     if options.readme is not None:
         try:
-            show(options.readme, folder)
+            results.show(options.readme, "bench", folder, readme.table)
         except ValueError as error:
             parser.error(str(error))
         return 0

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results of long runs: on which machine, as JSON in a folder that stays out of git, and as a table in the README."""
 
+import argparse
 import json
 import os
 import platform
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+
+from benchmarks import history
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -52,14 +55,26 @@ def marks(target: str) -> tuple[str, str]:
     return f"<!-- make {target}: begin -->", f"<!-- make {target}: end -->"
 
 
-def show(file: Path, target: str, table: str) -> None:
-    """Write the table of a `make` target into a file that has its marks.
+def offer_readme(parser: argparse.ArgumentParser) -> None:
+    """Let a command line ask for the table of the last full run in place of a new one."""
+    parser.add_argument("--readme", nargs="?", type=Path, const=ROOT / "README.md", metavar="FILE",
+                        help="run nothing, write the table of the last full run into FILE (default: README.md)")
+
+
+def show(file: Path, target: str, folder: Path, table: Callable[[history.Document], str]) -> None:
+    """Write the table of the last full run of a `make` target into a file that has its marks.
+
+    Args:
+        file: a README. target: "bench" or "soak". folder: its results. table: makes Markdown of them.
 
     Raises:
-        ValueError: it cannot be read or written, or there is no place for the table; one line.
+        ValueError: there is no such run, no place for the table, or it cannot be read or written; one line.
     """
+    document = history.full(folder)
+    if document is None:
+        raise ValueError(f"{folder} holds no full run: run make {target}, without ARGS, first")
     try:
-        file.write_text(put(file.read_text(encoding="utf-8"), target, table), encoding="utf-8")
+        file.write_text(put(file.read_text(encoding="utf-8"), target, table(document)), encoding="utf-8")
     except OSError as error:
         raise ValueError(f"{file}: {error.strerror}") from None
     except ValueError as error:

@@ -31,4 +31,3 @@ def table(document: Mapping[str, Any]) -> str:
             f"Of all targets {sum(judged)} of {len(judged)} are met")
     missed = [*document["missed"], *document["not_measured"]]
     return "\n".join([*lines, "", said + (f"; not: {'; '.join(missed)}." if missed else ".")])
-

@@ -24,7 +24,6 @@ from types import FrameType
 from typing import Any
 
 import results
-from benchmarks import history
 from graph import Graph, isolate
 from rclpy.signals import uninstall_signal_handlers
 from rich.console import Console
@@ -42,7 +41,7 @@ EXAMPLES = """examples:
   make soak
   make soak ARGS="--minutes 5 --seed 3"
   make soak ARGS="--minutes 2 --faults kill stop clock"
-  make soak ARGS=--readme              the table of the last whole run goes into README.md
+  make soak ARGS=--readme              the table of the last full run goes into README.md
 
 exit codes: 0 every promise was kept, 1 one was broken, 2 a wrong command line, or no results for the
 README, 130 interrupted"""
@@ -152,18 +151,6 @@ def readme(document: Mapping[str, Any]) -> str:
     return "\n".join([*rows, "", said])
 
 
-def into_readme(file: Path, folder: Path) -> None:
-    """Write the table of the last whole run into a README.
-
-    Raises:
-        ValueError: there is no such run, or no place for the table; one line.
-    """
-    document = history.full(folder)
-    if document is None:
-        raise ValueError(f"{folder} holds no whole run: run make soak, without ARGS, first")
-    results.show(file, "soak", readme(document))
-
-
 def main() -> int:
     """Run what the command line asks for."""
     parser = Parser(prog="soak", description=(__doc__ or "").partition("\n")[0], epilog=EXAMPLES,
@@ -173,12 +160,11 @@ def main() -> int:
     parser.add_argument("--faults", nargs="*", default=["all"], metavar="FAULT",
                         help="only those that have this in their names; none: steady work only. "
                         + ", ".join(FAULTS))
-    parser.add_argument("--readme", nargs="?", type=Path, const=results.ROOT / "README.md", metavar="FILE",
-                        help="run nothing, write the table of the last whole run into FILE (default: README.md)")
+    results.offer_readme(parser)
     options = parser.parse_args()
     if options.readme is not None:
         try:
-            into_readme(options.readme, RESULTS)
+            results.show(options.readme, "soak", RESULTS, readme)
         except ValueError as error:
             parser.error(str(error))
         return 0
