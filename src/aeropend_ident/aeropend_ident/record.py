@@ -10,6 +10,7 @@ on disk, so a recording that is killed opens like any other and ends at most hal
 from __future__ import annotations
 
 import errno
+import math
 import shutil
 import sqlite3
 import sys
@@ -51,6 +52,8 @@ TAKE_S = 0.01
 CHECKPOINT_S = 0.5
 LOOK_S = 0.2
 """How often new publishers are looked for, s."""
+JOINING_S = 1.2
+"""While a publisher and its listeners find each other the middleware may lose what is sent in between, s."""
 SILENT_S = 2.0
 """A topic of the sample rate that is silent for longer is reported, s."""
 DEPTH = 5000
@@ -102,6 +105,7 @@ class Tap:
     Attributes:
         count: messages written.
         lost: messages that were published to us and did not arrive, as far as their numbers tell.
+        lost_joining: those of them while a publisher was new.
         heard: when the last message came (monotonic, s); when the tap was opened, before the first.
     """
 
@@ -113,7 +117,7 @@ class Tap:
         self.qos: QoSProfile | None = None
         self.connection: Connection | None = None
         self.count = 0
-        self.lost = 0
+        self.lost = self.lost_joining = 0
         self.heard = time.monotonic()
         self.silent = False
         self.publishers = 0
@@ -121,6 +125,7 @@ class Tap:
         self._skipped = 0
         self._alone = True  # nobody has been there yet, so whoever comes first is
         self._heard_of = False
+        self._joined = -math.inf
 
     def take(self) -> tuple[int, bytes] | None:
         """Take the next message: receive time (ns) and what was on the wire. None when there is none."""
@@ -136,16 +141,21 @@ class Tap:
         self._number = number
         return info["received_timestamp"] or time.time_ns(), message
 
-    def count_publishers(self, publishers: int) -> None:
-        """Note how many publishers there are. Only one publisher's numbers, all the while, tell what was lost.
+    def count_publishers(self, publishers: int, now: float) -> None:
+        """Note how many publishers there are now (monotonic, s).
 
-        The interval after one has come or gone does not count either: it begins with what waits from both.
+        Only one publisher's numbers, all the while, tell what was lost. The interval after one has come or gone counts
+        as little: it begins with what waits from both.
         """
         alone = publishers <= 1 and (self.publishers == 1 or not self._heard_of)
         if alone and self._alone:
             self.lost += self._skipped
+            if now <= self._joined + JOINING_S:
+                self.lost_joining += self._skipped
         else:
             self._number = None
+        if publishers > self.publishers:
+            self._joined = now
         self._skipped, self._alone = 0, alone
         self._heard_of |= publishers > 0
         self.publishers = publishers
@@ -235,7 +245,7 @@ class Record(Node):
                     checkpoint = now + CHECKPOINT_S
                 self._display.update(now)
             for tap in self._taps.values():
-                tap.count_publishers(tap.publishers)
+                tap.count_publishers(tap.publishers, now)
             self._writer.close()
         except (OSError, sqlite3.Error, WriterError) as error:
             raise self._failure(error, stored) from error
@@ -304,7 +314,7 @@ class Record(Node):
                 return
             self._taps[topic] = tap
         publishers = self.get_publishers_info_by_topic(topic)
-        tap.count_publishers(len(publishers))
+        tap.count_publishers(len(publishers), now)
         qos = _qos_for([info.qos_profile for info in publishers])
         if tap.subscription is None or (tap.publishers and qos != tap.qos):
             if tap.subscription is not None:
@@ -346,8 +356,9 @@ class Record(Node):
             return f"{self._out}: no message was received; the bag is empty"
         span = (end - start) / 1e9
         parts = [f"{self.shorten(tap.topic)} {tap.count}" for tap in self.taps() if tap.count]
-        lost = sum(tap.lost for tap in self.taps())
-        return f"{self._out}: {span:.1f} s recorded: {', '.join(parts)}; {lost or 'none'} lost"
+        lost, joining = sum(tap.lost for tap in self.taps()), sum(tap.lost_joining for tap in self.taps())
+        when = f", {joining} of them in the first second of a publisher" if joining else ""
+        return f"{self._out}: {span:.1f} s recorded: {', '.join(parts)}; {lost or 'none'} lost{when}"
 
     def _report(self) -> tuple[str, Mapping[str, object]]:
         taps = self.taps()

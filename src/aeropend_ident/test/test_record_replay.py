@@ -136,12 +136,27 @@ class Told:
 def test_what_is_lost_is_told_by_the_numbers_of_one_publisher(looks, lost):
     tap = Tap("joint_states", "sensor_msgs/msg/JointState")
     for publishers, numbers in looks:
-        tap.count_publishers(publishers)
+        tap.count_publishers(publishers, 0.0)
         tap.subscription = Told(numbers)
         for _ in numbers:
             tap.take()
-    tap.count_publishers(tap.publishers)
+    tap.count_publishers(tap.publishers, 0.0)
     assert tap.lost == lost
+
+
+@pytest.mark.parametrize(("looks", "joining"), [
+    ([(100.0, 1, [1, 4]), (100.2, 1, [5, 9]), (101.0, 1, []), (101.5, 1, [10, 12]), (101.7, 1, [13])], 2 + 3),
+    ([(0.0, 1, [1, 2]), (50.0, 1, [5]), (50.2, 0, []), (60.0, 1, [1, 3]), (60.2, 1, [4]), (60.4, 1, [6]),
+      (60.6, 1, [7]), (61.6, 1, [9])], 1)])  # fmt: skip
+def test_what_is_lost_of_a_new_publisher_is_told_apart(looks, joining):
+    tap = Tap("joint_states", "sensor_msgs/msg/JointState")
+    for now, publishers, numbers in looks:
+        tap.count_publishers(publishers, now)
+        tap.subscription = Told(numbers)
+        for _ in numbers:
+            tap.take()
+    tap.count_publishers(tap.publishers, now)
+    assert tap.lost_joining == joining < tap.lost
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
