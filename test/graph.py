@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real node processes for the tests, and a node of the tests' own that listens to them."""
 
+import atexit
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -47,7 +49,9 @@ def isolate() -> None:
     """Keep this process and those it starts on this machine and in a domain of their own."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(os.getpid() % 50)
-    os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="aeropend_log_")
+    log = tempfile.mkdtemp(prefix="aeropend_log_")
+    atexit.register(shutil.rmtree, log, ignore_errors=True)
+    os.environ["ROS_LOG_DIR"] = log
 
 
 class Process:

@@ -100,7 +100,7 @@ def length(quick: bool) -> list[Figure]:
 
 def recordings(quick: bool) -> list[Figure]:
     """1 to 100 recordings of one rig, fitted together."""
-    counts = (1, 3, 10) if quick else (1, 10, 100)
+    counts = (1, 3, 10) if quick else (1, 3, 10, 30, 100)
     with tempfile.TemporaryDirectory(prefix="aeropend_bench_") as folder:
         bags = [made(Path(folder) / f"bag{k}", rig_with(EFFECT), 10.0, seed=k) for k in range(counts[-1])]
         slope, _ = curve("the number of recordings", "recordings of 10 s", counts,

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.signal import savgol_coeffs, savgol_filter
 
 from aeropend_sim.bench_fit import step_features
 
@@ -89,6 +88,8 @@ def step_responses(time: ArrayLike, y: ArrayLike, reference: ArrayLike, smoothin
 
 def _smoothed(time: Array, y: Array, width: float) -> tuple[Array, float]:
     """The response (N,) with its noise taken down, and the standard deviation of what is left of that."""
+    from scipy.signal import savgol_coeffs, savgol_filter  # takes long to import
+
     noise = math.sqrt(float(np.mean(np.diff(y, 2) ** 2)) / 6.0) if len(y) > 2 else 0.0
     window = 2 * round(0.5 * width * (len(time) - 1) / float(time[-1] - time[0])) + 1
     window = min(window, len(y) - 1 + len(y) % 2)

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from joblib import Parallel, delayed  # type: ignore[import-untyped]
 from threadpoolctl import threadpool_limits
 
 from aeropend_ident.gap.diagnosis import diagnose
@@ -93,6 +92,8 @@ def diagnose_each(bags: Sequence[str], commands: Sequence[str], settings: Settin
     if client is not None:
         yield from _on_cluster(client, tasks)
         return
+    from joblib import Parallel, delayed  # type: ignore[import-untyped]  # takes long to import
+
     warnings.filterwarnings("ignore", r".*tasks which (were|had)", UserWarning)  # joblib on being interrupted
     done = 0
     try:

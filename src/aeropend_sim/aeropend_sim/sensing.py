@@ -85,7 +85,8 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD) -> Chain:
 
 @njit(cache=True)
 def _encoder(theta: float, c: Chain) -> float:
-    return theta + c.bias + c.amplitude * math.sin(theta + c.phase)
+    angle = theta + c.bias
+    return angle + c.amplitude * math.sin(theta + c.phase) if c.amplitude != 0.0 else angle
 
 
 @njit(cache=True)

@@ -330,8 +330,10 @@ def structure(residual: Array, width: int, sigma: float) -> Array:
 
 def difference(measured: Array, simulated: Array) -> Array:
     """Measured minus simulated where something was measured; a simulation that ran away counts as far off."""
-    known = np.isfinite(measured)
-    return np.nan_to_num(measured[known] - simulated[known], nan=RAN_AWAY, posinf=RAN_AWAY, neginf=-RAN_AWAY)
+    off = (measured - simulated)[np.isfinite(measured)]
+    if np.isfinite(off).all():
+        return off
+    return np.nan_to_num(off, nan=RAN_AWAY, posinf=RAN_AWAY, neginf=-RAN_AWAY)
 
 
 def mean_speed(angle: Array, time: Array, length: Array, period: float) -> Array:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 Array = NDArray[np.float64]
 
@@ -130,6 +129,8 @@ def fit_gust(residual: Array, theta: Array, gravity: float, damping: float, nois
         theta: (N,) rad, the motion around which the arm is linear.
         gravity: mgd/J, 1/s²; damping: c/J, 1/s. noise: rad, of a reading. period: s between samples.
     """
+    from scipy.optimize import minimize  # takes long to import
+
     every = max(1, round(STEP / period))
     n = len(residual) // every
     blocks = residual[: n * every].reshape(n, every)

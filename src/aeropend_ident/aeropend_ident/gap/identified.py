@@ -16,7 +16,6 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from aeropend_ident.gap.chain import BLOCKS, Chain, Chains, with_values
 from aeropend_ident.gap.fit import Fit, Unknown, fit
@@ -371,6 +370,8 @@ def _curve(numbers: Mapping[str, float], dead: float, bend: float, load: float, 
 
 def _lift(model: Model, s: Signals) -> Array:
     """Thrust (N,) that the duty gives, over k_thrust: the speed squared, unless an effect of `SIZES` changes that."""
+    from scipy.signal import lfilter  # takes long to import
+
     n = model.numbers()
     hangs = abs(float(np.mean(s.theta[np.isfinite(s.theta)][:3]))) < HANGS
     before = 0.0 if hangs else float(s.duty[0])
