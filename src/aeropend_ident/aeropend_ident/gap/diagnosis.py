@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from aeropend_ident.gap import gust as gusts
-from aeropend_ident.gap import identified, shrink, where
+from aeropend_ident.gap import identified, random_torque, shrink, where
 from aeropend_ident.gap.chain import BLOCKS, PLACE_OF_NUMBER, Chain, Chains, difference, with_values
 from aeropend_ident.gap.experiment import EXPERIMENTS, next_experiment, within
 from aeropend_ident.gap.fit import Fit, Unknown, fit
-from aeropend_ident.gap.hypotheses import EFFECT_ODDS, Hypothesis, log_odds
-from aeropend_ident.gap.shape import Shape, hats, shapes
+from aeropend_ident.gap.hypotheses import EFFECT_ODDS, Hypothesis
+from aeropend_ident.gap.shape import Shape, shapes
 from aeropend_ident.gap.signals import CHANNELS, Signals
 from aeropend_ident.gap.thrift import ThriftyChains
 from aeropend_ident.gap.timing import timed
@@ -32,8 +31,8 @@ from aeropend_ident.gap.unknowns import (
     nominal_unknowns,
     number_unknowns,
 )
-from aeropend_ident.gap.weighing import Weighed, counts_of
-from aeropend_ident.gap.which import Findings, not_strayed, search
+from aeropend_ident.gap.weighing import GOOD_ENOUGH, Weighed
+from aeropend_ident.gap.which import Findings, not_strayed, refit, search
 from aeropend_sim.effects import CATALOGUE
 from aeropend_sim.excitation import Excitation
 from aeropend_sim.parameters import MODEL_NAMES, PARAMETERS, Model
@@ -41,13 +40,6 @@ from aeropend_sim.parameters import MODEL_NAMES, PARAMETERS, Model
 Array = NDArray[np.float64]
 
 Z95 = 1.959964
-GOOD_ENOUGH = 1.3
-"""RMS of a residual, in units of a reading's noise, up to which the model explains a channel."""
-
-RANDOM_TORQUE = 0.35
-"""A torque on the arm passes as random while the state predicts less than this share of it where it was not fitted,
-and free curves leave more than this share of what it does to the angle."""
-
 PLAIN = 15.0
 """Log evidence from which on an effect is there in an unknown rig, however unsure its size is."""
 
@@ -147,7 +139,8 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
         recordings = [replace(s, notes=(*s.notes, said)) for s in recordings]
     progress("looking for chance", 0.7)
     spikes = _spikes(recordings)
-    torque, misfit, variables = _random_torque(chains, findings)
+    torque = random_torque.found(chains, findings["arm"])
+    misfit, variables = _misfit_signal(chains, findings)
     strange = _strange(chains, findings, torque is not None, bool(spikes))
     progress("fitting the whole chain", 0.75)
     values, sd = _joint(chains, findings)
@@ -162,7 +155,7 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
     while chains.fit_nominal and (weak := _least_needed(model, findings, values, widened())):
         f = findings[weak[0]]
         f.found.remove(weak[1])
-        f.final = _refit(chains, f.block, f.effects, f.final.values)
+        f.final = refit(chains, f.block, f.effects, f.final.values)
         values, sd = _joint(chains, findings)
         checks = _checks(chains, findings)
     sd = widened()
@@ -172,7 +165,7 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
     progress("measuring the gap", 0.9)
     judged = values
     if fitted is not chains:
-        base_values, judged = (_refit(fitted, "arm", effects, start).values for start, effects in (
+        base_values, judged = (refit(fitted, "arm", effects, start).values for start, effects in (
             (base_values, []), (values, findings["arm"].effects)))
     before = [shrink.free_run(model, s, chains.own(base_values, k)) for k, s in enumerate(recordings)]
     after = [shrink.free_run(model, s, chains.own(judged, k)) for k, s in enumerate(recordings)]
@@ -413,93 +406,25 @@ def _spikes(recordings: Sequence[Signals]) -> Weighed | None:
                    1.0 / (1.0 + math.exp(-min(gain, 500.0))))
 
 
-def _random_torque(chains: Chains, findings: Mapping[str, Findings]) -> tuple[Weighed | None, Array, dict[str, Array]]:
-    """Judge `gust` on what the arm leaves, and the unexplained signal that regions are drawn from."""
+def _misfit_signal(chains: Chains, findings: Mapping[str, Findings]) -> tuple[Array, dict[str, Array]]:
+    """What the part that explains least leaves of its signal, and what regions may be drawn in, each (M,)."""
     block = max(BLOCKS, key=lambda b: _misfit_of(findings[b].base))
-    chain = chains.each[0]
+    chain, arm = chains.each[0], findings["arm"]
     s = chain.signals
-    arm = findings["arm"]
-    torque = _chance(chains, arm.final)
-    if torque is not None and arm.found and chains.fit_nominal:
-        _beside_chance(chains, arm)
-        torque = _chance(chains, arm.final)
     if block == "actuator":
         misfit, index = s.v_a - chain.actuator(chains.own(arm.final.values, 0)), np.arange(len(s))
     elif block == "motor":
         misfit = s.i_a - chain.motor(chains.own(findings["motor"].base.values, 0))[0]
         index = np.arange(len(s))
     else:
-        g = _tracked(chains, arm.final, arm.base)
+        g = random_torque.tracked(chains, arm.final, arm.base)
         misfit, index = g.torque, g.index
-    rate = np.gradient(_calm(_angle(chains, s)), s.period)
-    seen = _angle(chains, s) if chains.fit_nominal else s.theta
+    theta = random_torque.angle(chains, s)
+    rate = np.gradient(random_torque.calm(theta), s.period)
+    seen = theta if chains.fit_nominal else s.theta
     variables: dict[str, Array] = {"theta": seen[index], "theta_dot": rate[index], "omega": chain.speed[index],
                  "i_a": s.i_a[index], "duty": s.duty[index], "t": np.asarray(index * s.period, dtype=float)}
-    return torque, misfit[: len(index)], variables
-
-
-def _tracked(chains: Chains, arm: Fit, follow: Fit | None = None) -> gusts.Gust:
-    """The random torque that would do what a fit of the arm leaves; `follow`: what another one leaves."""
-    chain = chains.each[0]
-    s = chain.signals
-    n = with_values(chains.model, chains.own(arm.values, 0)).numbers()
-    left = (s.theta - chain.arm(chains.own((follow or arm).values, 0)))[: s.train]
-    return gusts.fit_gust(left, s.theta[: s.train], n["mgd_over_J"], n["c_over_J"], s.sigma["theta"], s.period)
-
-
-def _chance(chains: Chains, final: Fit) -> Weighed | None:
-    """`gust`, if what a fit of the arm leaves is a random torque: no state predicts it, and no free curve takes it."""
-    if final.scale.get("theta", 1.0) <= GOOD_ENOUGH:
-        return None
-    chain = chains.each[0]
-    s = chain.signals
-    g = _tracked(chains, final)
-    theta, speed = _angle(chains, s)[g.index], chain.speed[g.index]
-    rate = np.gradient(_calm(theta), g.index * s.period)
-    slope = np.gradient(speed, g.index * s.period)
-    columns = np.hstack([*(hats(x)[0] for x in (theta, rate, speed, slope)), (speed * rate)[:, None]])
-    known = [Unknown(u.name, u.mean, u.sd, u.low, u.high, None, u.log) for u in nominal_unknowns(chains, "arm")
-             if u.name in final.values]
-    curves = shapes(chains, "arm", final, known)[0]
-    if (g.gain <= 0.0 or gusts.follows_state(g.torque, columns) >= RANDOM_TORQUE
-            or curves.left - 1.0 <= RANDOM_TORQUE * (curves.before - 1.0)):
-        return None
-    values = {"gust.sigma": g.sigma, "gust.tau": g.tau}
-    sd = {"gust.sigma": g.sigma * g.sigma_sd, "gust.tau": g.tau * g.tau_sd}
-    return Weighed(Hypothesis("gust"), Fit(values, sd, {}, {}, {}, 0.0, {}), g.gain, 1.0)
-
-
-def _beside_chance(chains: Chains, arm: Findings) -> None:
-    """Take out what is not needed beside a random torque, the least needed first: chance looks like many an effect."""
-    all_ = _tracked(chains, arm.final)
-    while arm.found:
-        without = []
-        for round_ in arm.found:
-            h = round_[0].hypothesis
-            f = _refit(chains, "arm", [e for e in arm.effects if e is not h], arm.final.values)
-            g = _tracked(chains, f)
-            counts = counts_of([arm.final, f])
-            simpler = f.simplicity(counts) - arm.final.simplicity(counts)
-            without.append((all_.likelihood - g.likelihood - simpler + log_odds(h), round_, f, g))
-        gain, round_, f, g = min(without, key=lambda w: w[0])
-        if gain > 0.0:
-            break
-        arm.found.remove(round_)
-        arm.final, all_ = f, g
-
-
-def _angle(chains: Chains, s: Signals) -> Array:
-    """The angle (N,) without gaps: of an unknown rig, which may be read seldom, with lines across them."""
-    if not chains.fit_nominal:
-        return np.nan_to_num(s.theta)
-    known = np.flatnonzero(np.isfinite(s.theta))
-    return np.interp(np.arange(len(s)), known, s.theta[known])
-
-
-def _calm(x: Array) -> Array:
-    """A moving mean long enough to take a derivative of quantised angles."""
-    kernel = np.hanning(27)[1:-1]
-    return np.convolve(np.pad(x, 12, mode="edge"), kernel / kernel.sum(), mode="valid")
+    return misfit[: len(index)], variables
 
 
 def _misfit_of(f: Fit) -> float:
@@ -641,12 +566,6 @@ def _least_needed(model: Model, findings: Mapping[str, Findings], values: Mappin
             sure.append((abs(values[size] - _neutral(model, size)) / max(sd[size], 1e-300), block, round_))
     least = min(sure, key=lambda s: s[0], default=None)
     return least[1:] if least is not None and least[0] < Z95 else None
-
-
-def _refit(chains: Chains, block: str, effects: Sequence[Hypothesis], start: Mapping[str, float]) -> Fit:
-    """A part of the chain with these effects, fitted anew from where its values were."""
-    unknowns = [*nominal_unknowns(chains, block), *(u for h in effects for u in h.starts[0])]
-    return fit(chains.residuals(block), [replace(u, start=start.get(u.name, u.start)) for u in unknowns])
 
 
 def _neutral(model: Model, name: str) -> float:

@@ -39,6 +39,9 @@ CONTENDERS = 4
 CLOSE = 1.5
 """Rivals are close when their mean square residuals are within this factor."""
 
+GOOD_ENOUGH = 1.3
+"""RMS of a residual, in units of a reading's noise, up to which the model explains a channel."""
+
 FORM_SHOWS = 1.2
 """Mean square residual, in units of a reading's noise, from which on an effect must have another form."""
 

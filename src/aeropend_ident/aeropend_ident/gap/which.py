@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -196,23 +196,43 @@ def _started_late(chains: Chains, hypothesis: Hypothesis, values: Mapping[str, f
 
 
 def _prune(chains: Chains, findings: Findings, nominal: list[Unknown]) -> None:
-    """Take out again what was found first and is not needed beside what was found later, the least needed first."""
-    while len(findings.found) > 1:
-        without = []
-        for round_ in findings.found:
-            known = nominal
-            for h in findings.effects:
-                if h is not round_[0].hypothesis:
-                    known = adopted(known, h)
-            f = fit(chains.residuals(findings.block), started(known, findings.final.values))
-            counts = counts_of([findings.final, f])
-            gain = findings.final.evidence(counts) - f.evidence(counts) + log_odds(round_[0].hypothesis)
-            without.append((gain, round_, f))
-        gain, round_, f = min(without, key=lambda w: w[0])
-        if gain > 0.0:
+    """Take out again what was found first and is not needed beside what was found later."""
+    def without(h: Hypothesis) -> Fit:
+        known = nominal
+        for other in findings.effects:
+            if other is not h:
+                known = adopted(known, other)
+        return fit(chains.residuals(findings.block), started(known, findings.final.values))
+
+    def lost(f: Fit) -> float:
+        counts = counts_of([findings.final, f])
+        return findings.final.evidence(counts) - f.evidence(counts)
+
+    drop_unneeded(findings, without, lost, least=1)
+
+
+def drop_unneeded(findings: Findings, without: Callable[[Hypothesis], Fit], lost: Callable[[Fit], float], least: int = 0
+                  ) -> None:
+    """Take out what was found and is not needed, the least needed first.
+
+    Args:
+        findings: changed in place. without: fits what was found without one. lost: log evidence that such a fit has
+            less than `findings.final`. least: how many are kept in any case.
+    """
+    while len(findings.found) > least:
+        tried = [(round_, without(round_[0].hypothesis)) for round_ in findings.found]
+        needed = [lost(f) + log_odds(round_[0].hypothesis) for round_, f in tried]
+        k = needed.index(min(needed))
+        if needed[k] > 0.0:
             break
+        round_, findings.final = tried[k]
         findings.found.remove(round_)
-        findings.final = f
+
+
+def refit(chains: Chains, block: str, effects: Sequence[Hypothesis], start: Mapping[str, float]) -> Fit:
+    """A part of the chain with these effects, fitted anew from where its values were."""
+    unknowns = [*nominal_unknowns(chains, block), *(u for h in effects for u in h.starts[0])]
+    return fit(chains.residuals(block), [replace(u, start=start.get(u.name, u.start)) for u in unknowns])
 
 
 def _sure(log_odds: float) -> float:
