@@ -8,9 +8,7 @@ RUN_NODES = {"graph", "processes", "start"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark those that start nodes, those of the packages apart from those of `test`."""
+    """Mark those that start nodes."""
     for item in items:
         if RUN_NODES & set(getattr(item, "fixturenames", ())) or item.get_closest_marker("alone"):
             item.add_marker("live")
-        if item.get_closest_marker("live"):
-            item.add_marker(pytest.mark.xdist_group(item.path.relative_to(item.config.rootpath).parts[0]))

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The augmented model put to use: the plant node runs it, and a controller tuned on it does what was predicted."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from graph import stamps
@@ -17,9 +19,14 @@ from aeropend_sim.rig import Rig
 EFFECTS = ("bridge_drop", "thrust_exponent", "coulomb_friction", "cable_torque", "angle_offset")
 
 
+@cache
+def made(effect):
+    return case(effect, list(CATALOGUE).index(effect))
+
+
 @pytest.fixture(scope="module")
 def cases():
-    return {effect: case(effect, list(CATALOGUE).index(effect)) for effect in EFFECTS}
+    return {effect: made(effect) for effect in EFFECTS}
 
 
 def test_predictions_come_true_after_the_diagnosis_and_not_before(cases):
@@ -59,9 +66,9 @@ def test_the_table_shows_every_case(cases):
     assert table(list(cases.values())).row_count == 2 * len(EFFECTS)
 
 
-def test_the_plant_node_runs_the_augmented_model_to_the_last_bit(cases, graph, start, tmp_path):
+def test_the_plant_node_runs_the_augmented_model_to_the_last_bit(graph, start, tmp_path):
     file = tmp_path / "augmented.yaml"
-    save(cases["coulomb_friction"].augmented, file)
+    save(made("coulomb_friction").augmented, file)
     start("plant", "--ros-args", "--params-file", str(file), "-p", "speed:=0.8", "-p", "seed:=11")
     with (
         graph.listening(JointState, JOINT_STATES) as joints,
