@@ -73,13 +73,14 @@ def test_compared_is_with_the_last_full_run_of_the_same_machine(tmp_path):
 class TestReadme:
     def test_the_table_has_the_main_figures_with_all_that_belongs_to_them(self):
         met = figure(0.1, 0.09, 0.11, target=Target(0.2, "ratio"), main=True)
-        missed = figure(3.0, name="a | b", target=Target(0.1), main=True)
-        lines = readme.table(document(met, missed, figure(1.0, name="not shown"))).splitlines()
+        missed = figure(3.0, name="a | b", target=Target(0.1), main=True, note="s: 1: 2.0 s")
+        lines = readme.table(document(met, missed, figure(1.0, name="not shown", note="nor this"))).splitlines()
         assert lines[2] == "| reading | 0.5 s | rosbags: 1 s | 0.1 [0.09 .. 0.11] | ≤ 0.2 x peer | yes |"
         assert lines[3] == r"| a \| b | 0.5 s | rosbags: 1 s | 3 [3 .. 3] | ≤ 0.1 | **no** |"
         assert lines[4] == ""
         for said in ("one, 2 cores", "Python 3.12.1", "2026-01-01", "commit abc", "1 of 2 are met; not: a | b."):
             assert said in lines[5]
+        assert lines[6:] == ["", "- a | b: s: 1: 2.0 s"]
 
     def test_a_copy_of_the_readme_changes_between_the_marks_only(self, tmp_path):
         results.write(document(figure(0.1, main=True)), tmp_path)

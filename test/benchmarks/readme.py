@@ -15,7 +15,7 @@ def _cell(spread: Mapping[str, float] | None, unit: str) -> str:
 
 
 def table(document: Mapping[str, Any]) -> str:
-    """The main figures as Markdown, and on which machine, when and of what they were measured."""
+    """The main figures as Markdown, on which machine, when and of what they were measured, and the notes to them."""
     lines = ["| figure | ours | peer | ratio | target | met |", "| --- | --- | --- | --- | --- | --- |"]
     for one in document["figures"]:
         if one["main"]:
@@ -30,4 +30,6 @@ def table(document: Mapping[str, Any]) -> str:
             f"{document['date'][:10]}, commit {machine['commit']}, load {document['load_before']:.1f} at the start. "
             f"Of all targets {sum(judged)} of {len(judged)} are met")
     missed = [*document["missed"], *document["not_measured"]]
-    return "\n".join([*lines, "", said + (f"; not: {'; '.join(missed)}." if missed else ".")])
+    notes = [f"- {one['name']}: {one['note']}" for one in document["figures"] if one["main"] and one["note"]]
+    said += f"; not: {'; '.join(missed)}." if missed else "."
+    return "\n".join([*lines, "", said, *([""] if notes else []), *notes])
