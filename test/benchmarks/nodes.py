@@ -173,8 +173,7 @@ def recorded(recorder: str, seconds: float, bag: Path) -> dict[str, float]:
                 for one in plant_, excite, process:
                     one.check()
             cpu, wall = process.cpu_s() - cpu, time.monotonic() - start
-        if not recorder.endswith(".py"):  # in the peer, Ctrl-C may hit rclpy where it is an error like any other
-            process.check()
+        process.check()
     found = recording.read(bag, NAMESPACE)
     on_grid = (found.stamp_ns - found.stamp_ns[0]) % PERIOD_NS == 0
     whole = np.flatnonzero(np.isfinite(found.v_a) & np.isfinite(found.theta))

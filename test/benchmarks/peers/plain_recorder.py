@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What most people write: decoded subscriptions, spun by rclpy.spin, into rosbags' Writer."""
+"""What most people write: decoded subscriptions, spun as by rclpy.spin, into rosbags' Writer."""
 
+import signal
 import sys
 import time
 from functools import partial
 from typing import Any
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
+from rclpy.signals import SignalHandlerOptions
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import BatteryState, JointState
@@ -37,9 +39,12 @@ class PlainRecorder(Node):
 
 
 if __name__ == "__main__":
-    rclpy.init()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    ends: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: ends.append(number))  # raised inside rclpy, it can break the bag
     with Writer(sys.argv[1], version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        try:
-            rclpy.spin(PlainRecorder(writer))
-        except (KeyboardInterrupt, ExternalShutdownException):
-            rclpy.try_shutdown()
+        executor = SingleThreadedExecutor()
+        executor.add_node(PlainRecorder(writer))
+        while not ends:
+            executor.spin_once()
+    rclpy.shutdown()
