@@ -19,6 +19,7 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from aeropend_ident import dataset, recording
 from aeropend_ident.dataset import Dataset
@@ -103,6 +104,7 @@ class Identified:
     run: Array | None
 
 
+@threadpool_limits.wrap(limits=1)  # its matrices are too small for threads: they would take three times as long
 def identify(data: Dataset, method: str = "weak", terms: Sequence[str] | None = None, known: Equations | None = None,
              derivative: str = "smoothed", show: Show = nothing) -> Identified:
     """Find sparse equations of a dataset.

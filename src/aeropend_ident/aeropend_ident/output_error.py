@@ -377,6 +377,21 @@ class Fitter:
         return sum(float(r @ r) / (self.scale[name] ** 2 * self.inflation[name])
                    for name, shots in residuals.items() for r in shots)
 
+    @property
+    def weights(self) -> tuple[dict[str, float], dict[str, float]]:
+        """Size of each channel's noise, and how coloured it is."""
+        return dict(self.scale), dict(self.inflation)
+
+    def misfit(self, weights: tuple[dict[str, float], dict[str, float]]) -> float:
+        """The cost of the model as it is, with weights of another; infinite when it runs away."""
+        states = self.run(self.model, self.initial)
+        if states is None:
+            return np.inf
+        own, (self.scale, self.inflation) = self.weights, weights
+        cost = self.cost(self.residuals(states))
+        self.scale, self.inflation = own
+        return cost
+
     def reweigh(self, residuals: dict[str, list[Array]], *, coloured: bool = True) -> None:
         """Take the size of each channel's noise, and how coloured it is, from its residuals."""
         from aeropend_ident.gap.fit import independent_samples

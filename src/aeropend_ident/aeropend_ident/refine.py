@@ -34,6 +34,9 @@ SHOTS = 100
 MOST = 12
 """Terms of one equation at most."""
 
+SINGLE = 4
+"""Changes of a single term that are tried where the best of all supports does not keep what it promises."""
+
 BLOCKS, RESAMPLES = 24, 50
 """Stretches of time that are drawn anew, with repeats, and how often, to see which terms are chosen every time."""
 
@@ -284,26 +287,37 @@ def grow(fitter: Fitter, every: Entries, shape: tuple[int, ...], shot: int) -> N
 
 
 def choose(fitter: Fitter, every: Entries, shape: tuple[int, ...]) -> None:
-    """Change the terms until no change pays."""
-    seen: set[tuple[int, ...]] = set()
+    """Change the terms until no change pays: what the linearised problem promises, the free run must keep."""
     for _ in range(ROUNDS):
-        linear, now, _ = linearise(fitter, every, shape)
+        linear, now, normal = linearise(fitter, every, shape)
         chosen = tuple(linear.search(now))
-        if chosen == now or chosen in seen:
+        if chosen == now:
             return
-        seen.add(chosen)
-        before = fitter.state
-        fitter.model = moved(linear, every, chosen)
-        if fitter.fit(rounds=15):
-            continue
-        # too far for a straight line: from where the remaining coefficients were, new ones from 0
-        fitter.state = before
-        values = np.zeros(len(every))
-        values[list(now)] = fitter.model.value
-        fitter.model = replace(take(every, chosen), value=values[list(chosen)])
-        if not fitter.fit(rounds=30):
+        single = sorted([*linear.moves(now), *linear.exchanges(now)], key=lambda change: change.value)
+        value = normal.cost + linear.price * len(now)
+        before, weights = fitter.state, fitter.weights
+        for support in (chosen, *(change.support for change in single[:SINGLE])):
+            if changed(fitter, linear, every, now, support) and fitter.misfit(weights) + linear.price * len(
+                    support) < value:
+                break
             fitter.state = before
+        else:
+            fitter.fit(rounds=2)
             return
+
+
+def changed(fitter: Fitter, linear: Linear, every: Entries, now: Sequence[int], support: Sequence[int]) -> bool:
+    """Fit the model over another support; returns whether it can be run."""
+    before = fitter.state
+    fitter.model = moved(linear, every, support)
+    if fitter.fit(rounds=15):
+        return True
+    # too far for a straight line: from where the remaining coefficients were, new ones from 0
+    fitter.state = before
+    values = np.zeros(len(every))
+    values[list(now)] = fitter.model.value
+    fitter.model = replace(take(every, support), value=values[list(support)])
+    return fitter.fit(rounds=30)
 
 
 def take(every: Entries, support: Sequence[int]) -> Entries:
