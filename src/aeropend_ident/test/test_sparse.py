@@ -11,6 +11,7 @@ from aeropend_ident.discrepancy import nominal
 from aeropend_ident.identify import Problem, document, identify, lines
 from aeropend_ident.output_error import Entries, Fitter
 from aeropend_ident.recording import RecordingError
+from aeropend_ident.refine import Linear
 from aeropend_ident.sparse import Sums, select
 from aeropend_ident.terms import thesis_terms
 from aeropend_sim import actuator, dynamics
@@ -148,6 +149,11 @@ def test_such_a_term_is_left_out_where_held_out_data_do_not_miss_it():
     assert any("w is left out" in line for line in lines(found))
     (listed,) = document(found, "bag", "bench", 0.0)["undetermined"]
     assert (listed["term"], listed["left_out"]) == ("w", True)
+
+
+def test_a_choice_that_the_free_run_does_not_keep_is_taken_back(monkeypatch):
+    monkeypatch.setattr(Linear, "search", lambda linear, support: [])  # as near-collinear terms can make it
+    assert set(identify(pushed_once(0.02), "weak", TERMS).equations["x"]) == {"x", "u"}
 
 
 def test_the_normal_equations_of_stretches_add_up_to_those_of_the_whole():
