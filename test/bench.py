@@ -2,7 +2,7 @@
 """Measure speed, each figure beside its peer in the same run: `make bench`, or `make bench ARGS=--quick`.
 
 Prints a table and writes it as JSON to bench-results/. Ratios are compared with the last full run of the same machine.
-`--readme` measures nothing: it writes the table of the last full run into the README.
+`--readme` measures nothing: it writes the last full run, with what was measured again since, into the README.
 """
 
 import argparse
@@ -101,7 +101,7 @@ def measured(names: list[str], quick: bool, console: Console) -> dict[str, objec
     if figures:
         console.print(table(figures))
     return {
-        "format": 1, "date": datetime.now(timezone.utc).isoformat(timespec="seconds"), "quick": quick,
+        "format": 1, "names": names, "date": datetime.now(timezone.utc).isoformat(timespec="seconds"), "quick": quick,
         "full": not quick and set(names) == set(FIGURES), "seconds": round(time.monotonic() - start, 1),
         "machine": results.machine(PACKAGES) | {"gcc": results.first_line("gcc", "--version")},
         "load_before": load_before,
@@ -121,7 +121,7 @@ def main(arguments: list[str] | None = None, folder: Path = RESULTS) -> int:
     options = parser.parse_args(arguments)
     if options.readme is not None:
         try:
-            results.show(options.readme, "bench", folder, readme.table)
+            results.show(options.readme, "bench", history.renewed(folder), readme.table)
         except ValueError as error:
             parser.error(str(error))
         return 0

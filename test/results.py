@@ -61,18 +61,18 @@ def offer_readme(parser: argparse.ArgumentParser) -> None:
                         help="run nothing, write the table of the last full run into FILE (default: README.md)")
 
 
-def show(file: Path, target: str, folder: Path, table: Callable[[history.Document], str]) -> None:
+def show(file: Path, target: str, document: history.Document | None, table: Callable[[history.Document], str]) -> None:
     """Write the table of the last full run of a `make` target into a file that has its marks.
 
     Args:
-        file: a README. target: "bench" or "soak". folder: its results. table: makes Markdown of them.
+        file: a README. target: "bench" or "soak". document: its results, if there are any.
+        table: makes Markdown of them.
 
     Raises:
         ValueError: there is no such run, no place for the table, or it cannot be read or written; one line.
     """
-    document = history.full(folder)
     if document is None:
-        raise ValueError(f"{folder} holds no full run: run make {target}, without ARGS, first")
+        raise ValueError(f"{target}-results/ holds no full run: run make {target}, without ARGS, first")
     try:
         file.write_text(put(file.read_text(encoding="utf-8"), target, table(document)), encoding="utf-8")
     except OSError as error:

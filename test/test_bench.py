@@ -28,8 +28,9 @@ def figure(median, q1=None, q3=None, name="reading", target=None, **more):
 
 def document(*figures, date="2026-01-01T10:00:00+00:00", full=True, machine=MACHINE, load=0.1):
     listed = [{**asdict(one), "target": one.target and str(one.target), "met": one.met} for one in figures]
-    return {"format": 1, "date": date, "quick": False, "full": full, "machine": machine, "load_before": load,
-            "figures": listed, "not_measured": [], "missed": [one.name for one in figures if one.met is False]}
+    return {"format": 1, "names": ["read"], "date": date, "quick": False, "full": full, "machine": machine,
+            "load_before": load, "figures": listed, "not_measured": [], "again": [],
+            "missed": [one.name for one in figures if one.met is False]}
 
 
 @pytest.mark.parametrize(("now", "then", "told"), [
@@ -70,6 +71,25 @@ def test_compared_is_with_the_last_full_run_of_the_same_machine(tmp_path):
     assert history.full(tmp_path)["date"] == "other python"
 
 
+def test_what_was_measured_again_takes_the_place_of_what_a_full_run_found(tmp_path):
+    whole = document(figure(0.1, name="kept"), figure(0.2, target=Target(0.1, "ratio")), date="2026-01-02")
+    for name, one in {
+        "2026-01-01-10-00-00": document(figure(0.3), date="2026-01-01", full=False),
+        "2026-01-02-10-00-00": {**whole, "not_measured": ["read: not measured: why", "plant: not measured"]},
+        "2026-01-03-10-00-00": document(figure(0.05, target=Target(0.1, "ratio")), figure(1.0, name="new"), date="2026-01-03",
+                                        full=False, machine={**MACHINE, "commit": "def"}),
+        "2026-01-04-10-00-00": {**document(figure(0.4), date="2026-01-04", full=False), "quick": True},
+        "2026-01-05-10-00-00": document(figure(0.5), date="2026-01-05", full=False, machine={**MACHINE, "cpu": "two"}),
+    }.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(one))
+    found = history.renewed(tmp_path)
+    assert [(one["name"], one["ratio"]["median"]) for one in found["figures"]] == [
+        ("kept", 0.1), ("reading", 0.05), ("new", 1.0)]
+    assert (found["missed"], found["not_measured"]) == ([], ["plant: not measured"])
+    assert found["again"] == ["read on 2026-01-03, commit def"]
+    assert "Measured again since: read on 2026-01-03, commit def." in readme.table(found)
+
+
 class TestReadme:
     def test_the_table_has_the_main_figures_with_all_that_belongs_to_them(self):
         met = figure(0.1, 0.09, 0.11, target=Target(0.2, "ratio"), main=True)
@@ -89,7 +109,7 @@ class TestReadme:
         copy.write_text(f"{whole}\n{BEGIN}\nold\n{END}\nrest\n")
         for _ in range(2):
             assert bench.main(["--readme", str(copy)], tmp_path) == 0
-            table = readme.table(history.full(tmp_path))
+            table = readme.table(history.renewed(tmp_path))
             assert copy.read_text() == f"{whole}\n{BEGIN}\n{table}\n{END}\nrest\n"
 
     @pytest.mark.parametrize("text", [

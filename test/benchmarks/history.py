@@ -26,10 +26,31 @@ def full(folder: Path, machine: Mapping[str, object] | None = None) -> Document 
     """The latest full run, of the same processor with the same Python if one is given; None: there is none."""
     for path in sorted(folder.glob("[0-9]*.json"), reverse=True):
         document = read(path)
-        if document and document.get("full") and (
-                machine is None or all(document["machine"][k] == machine[k] for k in ("cpu", "python"))):
+        if document and document.get("full") and (machine is None or _same(document, machine)):
             return document
     return None
+
+
+def renewed(folder: Path) -> Document | None:
+    """The latest full run of `make bench` with what was measured again since (`--only`), told in its "again"."""
+    document = full(folder)
+    if document is None:
+        return None
+    figures = {one["name"]: one for one in document["figures"]}
+    missing, again = document["not_measured"], []
+    for path in sorted(folder.glob("[0-9]*.json")):
+        part = read(path)
+        if (part and part.get("quick") is False and not part["full"] and part["date"] > document["date"]
+                and _same(part, document["machine"]) and not part["not_measured"]):
+            figures |= {one["name"]: one for one in part["figures"]}
+            missing = [line for line in missing if line.partition(":")[0] not in part["names"]]
+            again.append(f"{', '.join(part['names'])} on {part['date'][:10]}, commit {part['machine']['commit']}")
+    missed = [name for name, one in figures.items() if one["met"] is False]
+    return {**document, "figures": list(figures.values()), "not_measured": missing, "missed": missed, "again": again}
+
+
+def _same(document: Document, machine: Mapping[str, object]) -> bool:
+    return all(document["machine"][k] == machine[k] for k in ("cpu", "python"))
 
 
 def worse(now: Document, then: Document) -> list[str]:

@@ -32,4 +32,5 @@ def table(document: Mapping[str, Any]) -> str:
     missed = [*document["missed"], *document["not_measured"]]
     notes = [f"- {one['name']}: {one['note']}" for one in document["figures"] if one["main"] and one["note"]]
     said += f"; not: {'; '.join(missed)}." if missed else "."
+    said += f" Measured again since: {'; '.join(document['again'])}." if document["again"] else ""
     return "\n".join([*lines, "", said, *([""] if notes else []), *notes])
