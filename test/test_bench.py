@@ -76,8 +76,8 @@ def test_what_was_measured_again_takes_the_place_of_what_a_full_run_found(tmp_pa
     for name, one in {
         "2026-01-01-10-00-00": document(figure(0.3), date="2026-01-01", full=False),
         "2026-01-02-10-00-00": {**whole, "not_measured": ["read: not measured: why", "plant: not measured"]},
-        "2026-01-03-10-00-00": document(figure(0.05, target=Target(0.1, "ratio")), figure(1.0, name="new"), date="2026-01-03",
-                                        full=False, machine={**MACHINE, "commit": "def"}),
+        "2026-01-03-10-00-00": document(figure(0.05, target=Target(0.1, "ratio")), figure(1.0, name="new"),
+                                        date="2026-01-03", full=False, machine={**MACHINE, "commit": "def"}),
         "2026-01-04-10-00-00": {**document(figure(0.4), date="2026-01-04", full=False), "quick": True},
         "2026-01-05-10-00-00": document(figure(0.5), date="2026-01-05", full=False, machine={**MACHINE, "cpu": "two"}),
     }.items():
