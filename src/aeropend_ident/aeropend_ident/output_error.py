@@ -22,6 +22,8 @@ from scipy.linalg.blas import dsyrk
 from aeropend_ident.terms import Array, Indices, Library, Table, terms_at
 
 Flags = NDArray[np.bool_]
+Weights = tuple[dict[str, float], dict[str, float]]
+"""Channel -> size of its noise; channel -> how coloured it is."""
 
 MOST_STEPS = 16
 """Steps of integration in a sample at most."""
@@ -372,25 +374,21 @@ class Fitter:
                 out[m.name].append((m.value - mean) / m.sigma)
         return out
 
-    def cost(self, residuals: dict[str, list[Array]]) -> float:
-        """Sum of squares with the weights as they are."""
-        return sum(float(r @ r) / (self.scale[name] ** 2 * self.inflation[name])
+    def cost(self, residuals: dict[str, list[Array]], weights: Weights | None = None) -> float:
+        """Sum of squares with these weights, or with those that are in force."""
+        scale, inflation = weights or self.weights
+        return sum(float(r @ r) / (scale[name] ** 2 * inflation[name])
                    for name, shots in residuals.items() for r in shots)
 
     @property
-    def weights(self) -> tuple[dict[str, float], dict[str, float]]:
-        """Size of each channel's noise, and how coloured it is."""
+    def weights(self) -> Weights:
+        """Those that are in force, as they are now."""
         return dict(self.scale), dict(self.inflation)
 
-    def misfit(self, weights: tuple[dict[str, float], dict[str, float]]) -> float:
+    def misfit(self, weights: Weights) -> float:
         """The cost of the model as it is, with weights of another; infinite when it runs away."""
         states = self.run(self.model, self.initial)
-        if states is None:
-            return np.inf
-        own, (self.scale, self.inflation) = self.weights, weights
-        cost = self.cost(self.residuals(states))
-        self.scale, self.inflation = own
-        return cost
+        return np.inf if states is None else self.cost(self.residuals(states), weights)
 
     def reweigh(self, residuals: dict[str, list[Array]], *, coloured: bool = True) -> None:
         """Take the size of each channel's noise, and how coloured it is, from its residuals."""

@@ -293,10 +293,9 @@ def choose(fitter: Fitter, every: Entries, shape: tuple[int, ...]) -> None:
         chosen = tuple(linear.search(now))
         if chosen == now:
             return
-        single = sorted([*linear.moves(now), *linear.exchanges(now)], key=lambda change: change.value)
         value = normal.cost + linear.price * len(now)
         before, weights = fitter.state, fitter.weights
-        for support in (chosen, *(change.support for change in single[:SINGLE])):
+        for support in promising(linear, now, chosen):
             if changed(fitter, linear, every, now, support) and fitter.misfit(weights) + linear.price * len(
                     support) < value:
                 break
@@ -304,6 +303,13 @@ def choose(fitter: Fitter, every: Entries, shape: tuple[int, ...]) -> None:
         else:
             fitter.fit(rounds=2)
             return
+
+
+def promising(linear: Linear, now: Sequence[int], chosen: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
+    """The best of all supports, then the best that differ from the present one by a single change."""
+    yield chosen
+    single = sorted([*linear.moves(now), *linear.exchanges(now)], key=lambda change: change.value)
+    yield from (change.support for change in single[:SINGLE])
 
 
 def changed(fitter: Fitter, linear: Linear, every: Entries, now: Sequence[int], support: Sequence[int]) -> bool:

@@ -159,15 +159,21 @@ def _search_block(chains: Chains, block: str, candidates: list[Hypothesis], wher
     return findings
 
 
+def _beside(findings: Findings, nominal: list[Unknown], hypothesis: Hypothesis) -> list[Unknown]:
+    """The unknowns of all that was found but one."""
+    known = nominal
+    for h in findings.effects:
+        if h is not hypothesis:
+            known = adopted(known, h)
+    return known
+
+
 def _swap(chains: Chains, findings: Findings, nominal: list[Unknown]) -> None:
     """Replace what was found first, and only stood in for what was not yet known of the others, by a close rival."""
     if len(findings.found) < 2:
         return
     for k, round_ in enumerate(findings.found):
-        known = nominal
-        for h in findings.effects:
-            if h is not round_[0].hypothesis:
-                known = adopted(known, h)
+        known = _beside(findings, nominal, round_[0].hypothesis)
         taken = {h.name for h in findings.effects}
         for rival in round_[1:CONTENDERS]:
             if rival.gain <= 0.0 or rival.hypothesis.name in taken:
@@ -198,10 +204,7 @@ def _started_late(chains: Chains, hypothesis: Hypothesis, values: Mapping[str, f
 def _prune(chains: Chains, findings: Findings, nominal: list[Unknown]) -> None:
     """Take out again what was found first and is not needed beside what was found later."""
     def without(h: Hypothesis) -> Fit:
-        known = nominal
-        for other in findings.effects:
-            if other is not h:
-                known = adopted(known, other)
+        known = _beside(findings, nominal, h)
         return fit(chains.residuals(findings.block), started(known, findings.final.values))
 
     def lost(f: Fit) -> float:
@@ -232,7 +235,7 @@ def drop_unneeded(findings: Findings, without: Callable[[Hypothesis], Fit], lost
 def refit(chains: Chains, block: str, effects: Sequence[Hypothesis], start: Mapping[str, float]) -> Fit:
     """A part of the chain with these effects, fitted anew from where its values were."""
     unknowns = [*nominal_unknowns(chains, block), *(u for h in effects for u in h.starts[0])]
-    return fit(chains.residuals(block), [replace(u, start=start.get(u.name, u.start)) for u in unknowns])
+    return fit(chains.residuals(block), started(unknowns, start))
 
 
 def _sure(log_odds: float) -> float:
