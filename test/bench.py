@@ -128,7 +128,7 @@ def main(arguments: list[str] | None = None, folder: Path = RESULTS) -> int:
     console = Console(width=None if sys.stdout.isatty() else 160)
     isolate()
     document: dict[str, Any] = measured(options.only, options.quick, console)
-    then = history.full(folder, document["machine"])
+    then = results.full(folder, document["machine"])
     worse = history.worse(document, then) if then else []
     path = results.write({**document, "compared_with": then and then["date"], "worse": worse}, folder)
     console.print(f"Median \\[quartiles]; ratio: ours over peer. Written to {path} and latest.json beside it.")

@@ -10,10 +10,12 @@ from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-
-from benchmarks import history
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
+
+Document = Mapping[str, Any]
+"""What a run wrote."""
 
 
 def machine(packages: Sequence[str] = ()) -> dict[str, object]:
@@ -50,6 +52,29 @@ def write(document: Mapping[str, object], folder: Path) -> Path:
     return path
 
 
+def read(path: Path) -> Document | None:
+    """A run's results; None where the file holds no such thing."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return document if isinstance(document, dict) and document.get("format") == 1 else None
+
+
+def full(folder: Path, like: Mapping[str, object] | None = None) -> Document | None:
+    """The latest full run, of the same processor with the same Python as `like` if given; None: there is none."""
+    for path in sorted(folder.glob("[0-9]*.json"), reverse=True):
+        document = read(path)
+        if document and document.get("full") and (like is None or on_same(document, like)):
+            return document
+    return None
+
+
+def on_same(document: Document, machine: Mapping[str, object]) -> bool:
+    """Whether a run was made by the same processor with the same Python."""
+    return all(document["machine"][k] == machine[k] for k in ("cpu", "python"))
+
+
 def marks(target: str) -> tuple[str, str]:
     """The two lines of the README between which is the table of a `make` target."""
     return f"<!-- make {target}: begin -->", f"<!-- make {target}: end -->"
@@ -61,7 +86,7 @@ def offer_readme(parser: argparse.ArgumentParser) -> None:
                         help="run nothing, write the table of the last full run into FILE (default: README.md)")
 
 
-def show(file: Path, target: str, document: history.Document | None, table: Callable[[history.Document], str]) -> None:
+def show(file: Path, target: str, document: Document | None, table: Callable[[Document], str]) -> None:
     """Write the table of the last full run of a `make` target into a file that has its marks.
 
     Args:

@@ -57,7 +57,7 @@ def test_what_changed_is_told_with_versions_commit_and_load():
 
 
 def test_compared_is_with_the_last_full_run_of_the_same_machine(tmp_path):
-    assert history.full(tmp_path, MACHINE) is None
+    assert results.full(tmp_path, MACHINE) is None
     for name, one in {
         "2026-01-01-10-00-00": document(date="first"),
         "2026-01-02-10-00-00": document(date="second"),
@@ -67,8 +67,8 @@ def test_compared_is_with_the_last_full_run_of_the_same_machine(tmp_path):
     }.items():
         (tmp_path / f"{name}.json").write_text(json.dumps(one))
     (tmp_path / "2026-01-06-10-00-00.json").write_text('{"format": 1, "da')
-    assert history.full(tmp_path, MACHINE)["date"] == "second"
-    assert history.full(tmp_path)["date"] == "other python"
+    assert results.full(tmp_path, MACHINE)["date"] == "second"
+    assert results.full(tmp_path)["date"] == "other python"
 
 
 def test_what_was_measured_again_takes_the_place_of_what_a_full_run_found(tmp_path):
@@ -80,6 +80,8 @@ def test_what_was_measured_again_takes_the_place_of_what_a_full_run_found(tmp_pa
                                         date="2026-01-03", full=False, machine={**MACHINE, "commit": "def"}),
         "2026-01-04-10-00-00": {**document(figure(0.4), date="2026-01-04", full=False), "quick": True},
         "2026-01-05-10-00-00": document(figure(0.5), date="2026-01-05", full=False, machine={**MACHINE, "cpu": "two"}),
+        "2026-01-06-10-00-00": {k: v for k, v in document(figure(0.6), date="2026-01-06", full=False).items()
+                                if k != "names"},
     }.items():
         (tmp_path / f"{name}.json").write_text(json.dumps(one))
     found = history.renewed(tmp_path)

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import results
-from benchmarks import history
 from graph import PATIENCE_S
 from soak.__main__ import MINUTES, main, readme
 from soak.faults import FAULTS
@@ -107,7 +106,7 @@ def test_the_table_of_the_last_whole_run_goes_into_a_readme(tmp_path):
     file = tmp_path / "README.md"
     file.write_text(f"before\n{begin}\nold\n{end}\nafter\n")
     with pytest.raises(ValueError, match="run make soak"):
-        results.show(file, "soak", history.full(tmp_path), readme)
+        results.show(file, "soak", results.full(tmp_path), readme)
     kept = [Promise("steady", "plant", "lost ticks: none", True, "0 of 9"),
             *(Promise("unplug", "bridge", what, what == "a | b", "found") for what in ("a | b", "c"))]  # fmt: skip
     whole = {"format": 1, "full": True, "date": "2026-01-02", "minutes": MINUTES, "seed": 1, "load_before": [0.2],
@@ -115,7 +114,7 @@ def test_the_table_of_the_last_whole_run_goes_into_a_readme(tmp_path):
              "promises": [asdict(one) for one in kept], "broken": [asdict(kept[-1])]}  # fmt: skip
     for name, change in (("1", {"date": "2026-01-01"}), ("2", {}), ("3", {"full": False})):
         (tmp_path / f"{name}.json").write_text(json.dumps({**whole, **change}))
-    results.show(file, "soak", history.full(tmp_path), readme)
+    results.show(file, "soak", results.full(tmp_path), readme)
     lines = file.read_text().splitlines()
     assert lines[:2] + lines[-2:] == ["before", begin, end, "after"]
     assert "| steady | plant | lost ticks: none | yes | 0 of 9 |" in lines

@@ -1,34 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of earlier runs: which one to compare with, which ratios got worse since then, and what else changed."""
+"""Results of earlier runs of `make bench`: what was measured again, which ratios got worse, and what else changed."""
 
-import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+
+from results import Document, full, on_same, read
 
 WORSE = 0.2
 """Share by which a ratio must be worse to be told; its quartiles must not touch those of before, either."""
-
-Document = Mapping[str, Any]
-"""What a run wrote."""
-
-
-def read(path: Path) -> Document | None:
-    """A run's results; None where the file holds no such thing."""
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return document if isinstance(document, dict) and document.get("format") == 1 else None
-
-
-def full(folder: Path, machine: Mapping[str, object] | None = None) -> Document | None:
-    """The latest full run, of the same processor with the same Python if one is given; None: there is none."""
-    for path in sorted(folder.glob("[0-9]*.json"), reverse=True):
-        document = read(path)
-        if document and document.get("full") and (machine is None or _same(document, machine)):
-            return document
-    return None
 
 
 def renewed(folder: Path) -> Document | None:
@@ -41,16 +19,12 @@ def renewed(folder: Path) -> Document | None:
     for path in sorted(folder.glob("[0-9]*.json")):
         part = read(path)
         if (part and part.get("quick") is False and not part["full"] and part["date"] > document["date"]
-                and _same(part, document["machine"]) and not part["not_measured"]):
+                and on_same(part, document["machine"]) and not part["not_measured"] and "names" in part):
             figures |= {one["name"]: one for one in part["figures"]}
             missing = [line for line in missing if line.partition(":")[0] not in part["names"]]
             again.append(f"{', '.join(part['names'])} on {part['date'][:10]}, commit {part['machine']['commit']}")
     missed = [name for name, one in figures.items() if one["met"] is False]
     return {**document, "figures": list(figures.values()), "not_measured": missing, "missed": missed, "again": again}
-
-
-def _same(document: Document, machine: Mapping[str, object]) -> bool:
-    return all(document["machine"][k] == machine[k] for k in ("cpu", "python"))
 
 
 def worse(now: Document, then: Document) -> list[str]:

@@ -27,7 +27,7 @@ from aeropend_ident.diagnose import document
 from aeropend_ident.gap.diagnosis import diagnose
 from aeropend_ident.gap.signals import from_recording
 from aeropend_sim.parameters import load
-from blind import bags, cases, limit, peers, plant, score, unknown
+from blind import bags, cases, limit, peers, plant, report, unknown
 
 MODEL = "bench"
 SEALED = "labels.sealed"
@@ -184,7 +184,7 @@ def main() -> None:
         asked = options.out / "peers.json"
         answers = json.loads(asked.read_text()) if asked.exists() else {}
         known = limits(options.out, labels, options.jobs) if answers else None
-        score.report(labels, verdicts, answers, options.out, known)
+        report.report(labels, verdicts, answers, options.out, known)
 
 
 if __name__ == "__main__":

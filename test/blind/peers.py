@@ -5,7 +5,7 @@ Both are done as well as their idea allows: they get the catalogue, the measurem
 already found, and the model's numbers free within their uncertainty. Neither can say `unknown`, and neither has a term
 for chance (`gust`, `speed_spikes`).
 
-Each returns {"effects": [keys, strongest first], "place": .., "seconds": ..}, as `score.report` takes it.
+Each returns {"effects": [keys, strongest first], "place": .., "seconds": ..}, as `report.report` takes it.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from aeropend_sim.effects import CATALOGUE, PARAMETER_MISMATCH
-from blind import score
+from blind import report, score
 
 SINGLES = [*CATALOGUE, PARAMETER_MISMATCH]
 
@@ -275,7 +275,7 @@ def test_report_writes_figures_and_pictures(tmp_path) -> None:
     peers = {"blind guess": {n: {"effects": ["gust"], "place": "arm", "seconds": 0.1} for n in some}}
     limits = {n: {"accuracy": 1.0, "hardest": "gust", "distance": 50.0} for n in some}
     text = io.StringIO()
-    result = score.report(labels, verdicts, peers, tmp_path / "out", limits, Console(file=text, width=140))
+    result = report.report(labels, verdicts, peers, tmp_path / "out", limits, Console(file=text, width=140))
     assert result["passed"]
     assert json.loads((tmp_path / "out" / "results.json").read_text()) == result
     assert result["misses"] == []
@@ -288,7 +288,7 @@ def test_report_writes_figures_and_pictures(tmp_path) -> None:
     worse = copy.deepcopy(verdicts)
     for n in some[:2]:
         retitle(worse[n], "none")
-    result = score.report(labels, worse, peers, tmp_path / "out", limits, Console(file=text, width=140))
+    result = report.report(labels, worse, peers, tmp_path / "out", limits, Console(file=text, width=140))
     assert not result["passed"]
     assert [f["met"] for f in result["figures"] if f["name"] == "below the limit"] == [False]
     assert [m["name"] for m in result["misses"]] == some[:2]

@@ -24,7 +24,6 @@ from types import FrameType
 from typing import Any
 
 import results
-from benchmarks import history
 from graph import Graph, isolate
 from rclpy.signals import uninstall_signal_handlers
 from rich.console import Console
@@ -165,7 +164,7 @@ def main() -> int:
     options = parser.parse_args()
     if options.readme is not None:
         try:
-            results.show(options.readme, "soak", history.full(RESULTS), readme)
+            results.show(options.readme, "soak", results.full(RESULTS), readme)
         except ValueError as error:
             parser.error(str(error))
         return 0

@@ -82,6 +82,11 @@ class Fit:
     prior: float
     slopes: Products
 
+    @property
+    def mean_square(self) -> float:
+        """Mean square residual over all channels, in units of a reading's noise."""
+        return float(np.mean(np.concatenate(list(self.residuals.values())) ** 2))
+
     def evidence(self, independent: Mapping[str, float]) -> float:
         """Log evidence of the hypothesis when a channel counts as so many independent samples."""
         return self.likelihood(independent) + self.simplicity(independent)

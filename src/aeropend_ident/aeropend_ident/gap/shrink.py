@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.gap.chain import mean_speed, with_values
+from aeropend_ident.gap.chain import Chains, mean_speed, with_values
 from aeropend_ident.gap.signals import CHANNELS, Signals
 from aeropend_sim import actuator, dynamics, sensing
 from aeropend_sim.parameters import Model
@@ -146,3 +147,42 @@ def closed(before: Gap, after: Gap, floors: Mapping[str, float], seed: int = 0
     shares = np.minimum((b - a) / np.maximum(b - bottom, 1e-3 * bottom), 1.0)
     low, high = np.percentile(shares, [2.5, 97.5])
     return share, float(min(low, share)), float(max(high, share))
+
+
+class Scorer:
+    """Measures the gap of models on the held-out part of every recording."""
+
+    def __init__(self, chains: Chains, model: Model, recordings: Sequence[Signals], spikes: bool) -> None:
+        self.chains, self.model, self.recordings, self.spikes = chains, model, recordings, spikes
+
+    def gap(self, readings: Sequence[Mapping[str, Array]], known: bool = True) -> Gap:
+        """The gap over all recordings; `known`: false periods of the speed are told apart if they were found."""
+        gaps = [gap(r, s, s.train, len(s), s.false_speed if known and self.spikes else None)
+                for r, s in zip(readings, self.recordings, strict=True)]
+        if len(gaps) == 1:
+            return gaps[0]
+        channels = [c for c in CHANNELS if all(c in g.rms for g in gaps)]
+        rms = {c: math.sqrt(float(np.mean([g.rms[c] ** 2 for g in gaps]))) for c in channels}
+        spread = {c: math.sqrt(float(np.mean([g.spread[c] ** 2 for g in gaps]))) for c in channels}
+        columns = [[list(g.rms).index(c) for c in channels] for g in gaps]
+        windows = np.concatenate([g.windows[:, i] for g, i in zip(gaps, columns, strict=True)])
+        return Gap(rms, spread, windows)
+
+    def of(self, values: Mapping[str, float]) -> Gap:
+        """The gap of the model with these values."""
+        return self.gap([free_run(self.model, s, self.chains.own(values, k))
+                         for k, s in enumerate(self.recordings)])
+
+    def squared(self, values: Mapping[str, float]) -> float:
+        """The squared total gap of the model with these values."""
+        return self.of(values).total ** 2
+
+    def floors(self) -> dict[str, float]:
+        """The floor by channel over all recordings."""
+        each = [floor(s, s.train, len(s)) for s in self.recordings]
+        return {c: math.sqrt(float(np.mean([f[c] ** 2 for f in each]))) for c in CHANNELS}
+
+    @staticmethod
+    def bottom(gap: Gap, floors: Mapping[str, float]) -> float:
+        """The floor of the total gap."""
+        return math.sqrt(float(np.mean([(floors[c] / gap.spread[c]) ** 2 for c in gap.rms])))

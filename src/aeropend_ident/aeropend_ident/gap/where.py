@@ -9,6 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from aeropend_ident.gap import random_torque
+from aeropend_ident.gap.chain import BLOCKS, Chains
+from aeropend_ident.gap.fit import Fit
+from aeropend_ident.gap.which import Findings
 from aeropend_sim.effects import PLACES
 
 Array = NDArray[np.float64]
@@ -25,6 +29,27 @@ def shares(amounts: Iterable[tuple[str, float]]) -> dict[str, float]:
         total[place] += amount
     everything = sum(total.values())
     return {place: (x / everything if everything > 0.0 else 0.0) for place, x in total.items()}
+
+
+def misfit_signal(chains: Chains, findings: Mapping[str, Findings]) -> tuple[Array, dict[str, Array]]:
+    """What the part that explains least leaves of its signal, and what regions may be drawn in, each (M,)."""
+    block = max(BLOCKS, key=lambda b: _worst(findings[b].base))
+    chain, arm = chains.each[0], findings["arm"]
+    s = chain.signals
+    if block == "actuator":
+        misfit, index = s.v_a - chain.actuator(chains.own(arm.final.values, 0)), np.arange(len(s))
+    elif block == "motor":
+        misfit = s.i_a - chain.motor(chains.own(findings["motor"].base.values, 0))[0]
+        index = np.arange(len(s))
+    else:
+        g = random_torque.tracked(chains, arm.final, arm.base)
+        misfit, index = g.torque, g.index
+    theta = random_torque.angle(chains, s)
+    rate = np.gradient(random_torque.calm(theta), s.period)
+    seen = theta if chains.fit_nominal else s.theta
+    variables: dict[str, Array] = {"theta": seen[index], "theta_dot": rate[index], "omega": chain.speed[index],
+                 "i_a": s.i_a[index], "duty": s.duty[index], "t": np.asarray(index * s.period, dtype=float)}
+    return misfit[: len(index)], variables
 
 
 def regions(misfit: Array, variables: Mapping[str, Array], most: int = 3) -> list[dict[str, Any]]:
@@ -70,3 +95,7 @@ def _best_run(x: Array) -> tuple[int, int]:
         if total > best:
             best, at = total, (start, j)
     return at
+
+
+def _worst(f: Fit) -> float:
+    return max((float(np.mean(r * r)) for r in f.residuals.values()), default=0.0)
