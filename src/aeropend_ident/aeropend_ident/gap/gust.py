@@ -167,6 +167,20 @@ def fit_gust(residual: Array, theta: Array, gravity: float, damping: float, nois
                 index, whiteness)
 
 
+def gauss_markov(shape: tuple[int, int], tau: float, period: float, rng: np.random.Generator) -> Array:
+    """Random torques (D, N) of that shape, each of variance 1, correlated over tau, s; period: s between samples."""
+    return _correlated(rng.standard_normal(shape), math.exp(-period / tau))
+
+
+@njit(cache=True, nogil=True)
+def _correlated(white: Array, keep: float) -> Array:
+    kick = math.sqrt(1.0 - keep * keep)
+    for row in white:
+        for k in range(1, len(row)):
+            row[k] = keep * row[k - 1] + kick * row[k]
+    return white
+
+
 def follows_state(torque: Array, columns: Array) -> float:
     """Share of the torque's variance (up to 1) that a linear combination of columns predicts where it was not fitted.
 

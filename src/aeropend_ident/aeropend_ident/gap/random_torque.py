@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from aeropend_ident.gap.chain import Chains, with_values
 from aeropend_ident.gap.fit import Fit, Unknown
-from aeropend_ident.gap.gust import Gust, fit_gust, follows_state
+from aeropend_ident.gap.gust import Gust, fit_gust, follows_state, gauss_markov
 from aeropend_ident.gap.hypotheses import Hypothesis
 from aeropend_ident.gap.shape import hats, shapes
 from aeropend_ident.gap.signals import Signals
@@ -19,8 +19,14 @@ from aeropend_ident.gap.which import Findings, drop_unneeded, refit
 Array = NDArray[np.float64]
 
 RANDOM = 0.35
-"""A torque on the arm passes as random while the state predicts less than this share of it where it was not fitted,
-and free curves leave more than this share of what it does to the angle."""
+"""A torque on the arm passes as random while the state predicts less than this share of it where it was not fitted."""
+
+UNEXPLAINED = 0.4
+"""And while free curves leave more than this of the share that they would leave of such a torque: of a short recording
+they follow most of what chance does, too."""
+
+DRAWS = 20
+"""Random torques from which that share is known."""
 
 
 def found(chains: Chains, arm: Findings) -> Weighed | None:
@@ -68,9 +74,11 @@ def _weighed(chains: Chains, final: Fit) -> Weighed | None:
     columns = np.hstack([*(hats(x)[0] for x in (theta, rate, speed, slope)), (speed * rate)[:, None]])
     known = [Unknown(u.name, u.mean, u.sd, u.low, u.high, None, u.log) for u in nominal_unknowns(chains, "arm")
              if u.name in final.values]
-    curves = shapes(chains, "arm", final, known)[0]
-    if (g.gain <= 0.0 or follows_state(g.torque, columns) >= RANDOM
-            or curves.left - 1.0 <= RANDOM * (curves.before - 1.0)):
+    if g.gain <= 0.0 or follows_state(g.torque, columns) >= RANDOM:
+        return None
+    rng = np.random.default_rng(0)
+    curves = shapes(chains, "arm", final, known, torques=lambda n: gauss_markov((DRAWS, n), g.tau, s.period, rng))[0]
+    if curves.left - 1.0 <= UNEXPLAINED * curves.left_of_chance * (curves.before - 1.0):
         return None
     values = {"gust.sigma": g.sigma, "gust.tau": g.tau}
     sd = {"gust.sigma": g.sigma * g.sigma_sd, "gust.tau": g.tau * g.tau_sd}

@@ -66,6 +66,7 @@ class Shape:
         place: of the chain. curves: the term, as their sum.
         left: mean square of what it leaves, in units of a reading's noise. before: the same without it.
         samples: of all channels, that it was sought in. independent: how many independent ones that is worth.
+        left_of_chance: share of the mean square that it would leave of random torques on the arm, if it was asked.
     """
 
     place: str
@@ -74,6 +75,7 @@ class Shape:
     before: float
     samples: int
     independent: float
+    left_of_chance: float = math.nan
 
     @property
     def explained(self) -> float:
@@ -169,20 +171,26 @@ def _curves(train: int, variables: Mapping[str, NDArray[Any]], unit: str, factor
     return found
 
 
+def _driven(chain: Chain, values: Mapping[str, float], drive: Array) -> dict[str, Array]:
+    """Response of the angle (K, N) to torques over inertia (K, N)."""
+    model = chain.valued(values)
+    n = model.numbers()
+    tau = model.sensing["angle_filter_tau"] + model.effects.get("encoder_lag", {}).get("tau", 0.0)
+    stiffness = n["mgd_over_J"] * np.cos(chain.arm_motion(values)[0])
+    return {"theta": arm_response(drive, stiffness, n["c_over_J"], tau, chain.signals.period)}
+
+
 def _arm(chain: Chain, values: Mapping[str, float], any_time: bool) -> Places:  # noqa: ARG001
     s = chain.signals
     model = chain.valued(values)
     n = model.numbers()
     theta, rate = chain.arm_motion(values)
     speed = chain.speed
-    tau = model.sensing["angle_filter_tau"] + model.effects.get("encoder_lag", {}).get("tau", 0.0)
-    stiffness = n["mgd_over_J"] * np.cos(theta)
     force = n["L_over_J"] * n["k_thrust"] * speed**2
     t = np.arange(len(s)) * s.period
 
     def respond(block: Block) -> tuple[Block, dict[str, Array]]:
-        drive = np.concatenate([columns for *_, columns in block])
-        return block, {"theta": arm_response(drive, stiffness, n["c_over_J"], tau, s.period)}
+        return block, _driven(chain, values, np.concatenate([columns for *_, columns in block]))
 
     thrust = [*_curves(s.train, {"omega": speed}, "rad/s²"),
               *_curves(s.train, {"theta": theta}, "-", force, " (share of the thrust)"),
@@ -265,12 +273,14 @@ def _rows(chain: Chain, channel: str, response: Mapping[str, Array], count: int)
     return response[channel][:, start:s.train][:, known] / s.sigma[channel]
 
 
-def shapes(chains: Chains, block: str, base: Fit, known: Sequence[Unknown], *, any_time: bool = False) -> list[Shape]:
+def shapes(chains: Chains, block: str, base: Fit, known: Sequence[Unknown], *, any_time: bool = False,
+           torques: Callable[[int], Array] | None = None) -> list[Shape]:
     """The missing term at each place of a part of the chain, the place that explains most first.
 
     Args:
         chains: cut. block: the part. base: a fit of it. known: the unknowns of that fit that are refitted along.
         any_time: weigh the places of the motor with a term free in time besides (a second or two).
+        torques: makes random torques on the arm (D, N), rad/s², of N samples: what of them each place would leave.
     """
     chains = chains.head(MOST_AT_ANY_TIME if any_time else MOST_SAMPLES)
     begun = [Unknown(u.name, u.mean, u.sd, u.low, u.high, base.values[u.name], u.log) for u in known
@@ -286,6 +296,13 @@ def shapes(chains: Chains, block: str, base: Fit, known: Sequence[Unknown], *, a
     makers: dict[str, Callable[[Chain, Mapping[str, float], bool], Places]] = {
         "arm": _arm, "motor": _motor, "actuator": _actuator}
     made = [makers[block](chain, chains.own(base.values, k), any_time) for k, chain in enumerate(chains.each)]
+    chance = None
+    if torques is not None:
+        moved = [_driven(chain, chains.own(base.values, k), torques(len(chain.signals)))
+                 for k, chain in enumerate(chains.each)]
+        parts = [(channel, int(which or 0)) for channel, _, which in (name.partition("@") for name in search.weight)]
+        chance = np.concatenate([_rows(chains.each[k], channel, moved[k], len(moved[k]["theta"]))
+                                 for channel, k in parts], axis=1)
     found = []
     for place in made[0]:
         curves = made[0][place][0][0]
@@ -312,5 +329,9 @@ def shapes(chains: Chains, block: str, base: Fit, known: Sequence[Unknown], *, a
             if variable != AT_ANY_TIME:
                 drawn.append(Curve(variable, unit, knots, values[at:at + len(c)]))
             at += len(c)
-        found.append(Shape(place, drawn, left, before, len(r), independent_samples(rest)))
+        of_chance = math.nan
+        if chance is not None:
+            spared = chance.T - rows.T @ np.linalg.solve(information, rows @ chance.T)
+            of_chance = float(np.mean(spared**2) / np.mean(chance**2))
+        found.append(Shape(place, drawn, left, before, len(r), independent_samples(rest), of_chance))
     return sorted(found, key=lambda shape: shape.left)
