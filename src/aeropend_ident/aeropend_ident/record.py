@@ -121,9 +121,9 @@ class Tap:
         self.heard = time.monotonic()
         self.silent = False
         self.publishers = 0
-        self._number: int | None = None  # of the last message, by its publisher's count
+        self._last: list[int] = []  # number of each publisher's last message, by its own count; the latest at the end
         self._skipped = 0
-        self._alone = True  # nobody has been there yet, so whoever comes first is
+        self._settled = True  # nobody has been there yet, so whoever comes first is alone
         self._heard_of = False
         self._joined = -math.inf
 
@@ -136,27 +136,34 @@ class Tap:
             return None
         message, info = taken
         number = info["publication_sequence_number"]
-        if self._number is not None and number is not None and number > self._number + 1:
-            self._skipped += number - self._number - 1
-        self._number = number
+        if number is not None:
+            # who it is from is not told; of those that it may follow, the nearest: the sum is right whichever it was
+            before = max((last for last in self._last if last < number), default=None)
+            all_known = len(self._last) >= self.publishers
+            if before is not None and (all_known or before == number - 1):
+                self._skipped += number - before - 1
+                self._last.remove(before)
+            self._last.append(number)
         return info["received_timestamp"] or time.time_ns(), message
 
     def count_publishers(self, publishers: int, now: float) -> None:
         """Note how many publishers there are now (monotonic, s).
 
-        Only one publisher's numbers, all the while, tell what was lost. The interval after one has come or gone counts
-        as little: it begins with what waits from both.
+        Numbers tell what was lost as long as it is the same publishers. The interval after one has come or gone counts
+        as little: it begins with what waits from all.
         """
         alone = publishers <= 1 and (self.publishers == 1 or not self._heard_of)
-        if alone and self._alone:
+        settled = alone or publishers == self.publishers > 1
+        if settled and self._settled:
             self.lost += self._skipped
             if now <= self._joined + JOINING_S:
                 self.lost_joining += self._skipped
+            self._last = self._last[-max(publishers, 1):]
         else:
-            self._number = None
+            self._last.clear()
         if publishers > self.publishers:
             self._joined = now
-        self._skipped, self._alone = 0, alone
+        self._skipped, self._settled = 0, settled
         self._heard_of |= publishers > 0
         self.publishers = publishers
 

@@ -132,8 +132,11 @@ class Told:
     ([(1, [1, 2]), (1, [3, 6]), (0, [9]), (0, [])], 2),  # what waits when it has gone may be another's
     ([(1, [1, 2]), (2, [3, 500, 4]), (2, [501, 7]), (1, [502]), (1, [503, 504]), (1, [505, 507])], 1),
     ([(2, [1, 500]), (2, [2, 501]), (1, [502]), (1, [503])], 0),
+    ([(2, [1, 500]), (2, [2, 501]), (2, [3, 502, 4]), (2, [6, 503, 507]), (2, [8, 508])], 1 + 3 + 1),
+    ([(2, [10, 20]), (2, [11, 21]), (2, [12, 22]), (2, [30, 23, 31, 24])], 17),  # who overtakes whom does not matter
+    ([(2, [7]), (2, [8]), (2, [9]), (2, [11])], 0),  # the first of the other?
     ([(1, [1, 2]), (0, []), (1, [700, 702]), (1, [703, 705])], 1)])  # fmt: skip
-def test_what_is_lost_is_told_by_the_numbers_of_one_publisher(looks, lost):
+def test_what_is_lost_is_told_by_the_numbers_of_its_publishers(looks, lost):
     tap = Tap("joint_states", "sensor_msgs/msg/JointState")
     for publishers, numbers in looks:
         tap.count_publishers(publishers, 0.0)
