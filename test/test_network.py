@@ -21,7 +21,7 @@ from std_srvs.srv import SetBool
 from aeropend_ident.record import TOPICS
 from aeropend_sim import interface
 from aeropend_sim.interface import ARMATURE, DUTY_COMMAND, ENABLE, JOINT_STATES, REFERENCE
-from aeropend_sim.transport import LOCALHOST, PROFILES, RANGE, TRANSPORTS, without_shared_memory
+from aeropend_sim.transport import FOUND_BY_NAME, LOCALHOST, PROFILES, RANGE, SUBNET, TRANSPORTS, without_shared_memory
 
 ROOT = Path(__file__).parents[1]
 PEOPLE = {"operator", "viewer"}
@@ -142,17 +142,27 @@ SHARED = {RANGE: "LOCALHOST", TRANSPORTS: "DEFAULT"}
 
 
 @pytest.mark.parametrize(("given", "expected"), [
-    ({}, {TRANSPORTS: "UDPv4"}),
-    ({RANGE: "SUBNET"}, {RANGE: "SUBNET", TRANSPORTS: "UDPv4"}),
+    ({}, {PROFILES: str(SUBNET)}),
+    ({RANGE: "SUBNET"}, {RANGE: "SUBNET", PROFILES: str(SUBNET)}),
+    ({RANGE: "OFF", TRANSPORTS: "UDPv4"}, {RANGE: "OFF", PROFILES: str(SUBNET)}),
     ({RANGE: "LOCALHOST"}, {RANGE: "SUBNET", PROFILES: str(LOCALHOST)}),
     ({RANGE: "LOCALHOST", TRANSPORTS: "UDPv4"}, {RANGE: "SUBNET", PROFILES: str(LOCALHOST)}),
     ({RANGE: "LOCALHOST", PROFILES: "mine.xml"}, {RANGE: "LOCALHOST", PROFILES: "mine.xml"}),
+    ({PROFILES: "mine.xml"}, {PROFILES: "mine.xml"}),
     (SHARED, SHARED),
 ])
 def test_messages_go_by_udp_unless_somebody_chose(given, expected):
     for _ in range(2):  # a process it starts does it once more
         without_shared_memory(given := dict(given))
         assert given == expected
+
+
+@pytest.mark.parametrize("name", FOUND_BY_NAME)
+def test_a_profile_in_the_folder_of_a_process_is_left_to_work(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).touch()
+    without_shared_memory(given := {RANGE: "LOCALHOST"})
+    assert given == {RANGE: "LOCALHOST"}
 
 
 def threads(process):
@@ -172,6 +182,17 @@ def test_a_node_has_no_shared_memory_hears_no_multicast_and_is_heard_by_all(grap
         graph.until(lambda: len(heard) > 100, "samples")
     assert any(name.startswith("dds.shm") for name in threads(plant)) == shared
     assert f"dds.udp.{7400 + 250 * int(os.environ['ROS_DOMAIN_ID'])}" not in threads(plant)
+
+
+def test_a_node_has_no_shared_memory_either_where_it_is_not_kept_to_this_machine(start, monkeypatch):
+    """With the range OFF, in which it has the same profile as on a network: no test talks to other machines."""
+    for name in (PROFILES, TRANSPORTS):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv(RANGE, "OFF")
+    plant = start("plant")
+    plant.wait_for("model bench")
+    assert any(name.startswith("dds.udp") for name in threads(plant))
+    assert not any(name.startswith("dds.shm") for name in threads(plant))
 
 
 RIG = ["-r", f"{JOINT_STATES}:=/strange/{JOINT_STATES}", "-r", f"{ARMATURE}:=/strange/{ARMATURE}"]
