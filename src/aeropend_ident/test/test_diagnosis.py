@@ -78,8 +78,8 @@ def test_what_the_catalogue_does_not_hold_is_unknown():
     jumps = np.cumsum(np.random.default_rng(1).choice([0.0, 0.08, -0.08], len(duty), p=[0.999, 0.0005, 0.0005]))
     columns["theta"] = columns["theta"] + jumps
     body = diagnose(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)], 2).body
-    assert body["which"]["verdict"] in {"unknown", "gust"}
-    assert body["shrink"]["closed"] < 0.8
+    assert body["which"]["verdict"] == "unknown"
+    assert body["which"]["effects"] == []  # no random torque moves the arm in jumps
 
 
 @pytest.mark.parametrize("without", [("omega",), ("i_a", "v_a"), ("omega", "i_a", "v_a")])

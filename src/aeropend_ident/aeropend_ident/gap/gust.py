@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 STEP = 0.01
 """s between the residuals that the filter takes: the arm is slow."""
 
+SETTLED = 1.0
+"""s after which the filter has forgotten that what moved the arm before the recording was not seen."""
+
 NOTHING = np.empty((0, 18))
 
 FOLDS = 10
@@ -33,7 +36,8 @@ class Gust:
         sigma: rad/s², and tau: s, estimates. sigma_sd: relative, and tau_sd: likewise, of their logarithms.
         likelihood: its logarithm. gain: the same over no torque but inflated white noise.
         torque: (M,) rad/s², smoothed, at `index` (M,) of the samples.
-        whiteness: lag-one correlation of the filter's innovations.
+        heavy: mean fourth power of the filter's innovations over that of normal ones of the same variance; far above 1
+            the angle jumps, which no torque makes it do.
     """
 
     sigma: float
@@ -44,7 +48,7 @@ class Gust:
     gain: float
     torque: Array
     index: NDArray[np.int64]
-    whiteness: float
+    heavy: float
 
 
 @njit(cache=True, nogil=True)
@@ -161,10 +165,10 @@ def fit_gust(residual: Array, theta: Array, gravity: float, damping: float, nois
     kept = np.empty((n, 18))
     cost(z, kept)
     _smooth(kept, stiffness, damping, h, math.exp(z[1]), torque)
-    e = innovations
-    whiteness = float(np.mean(e[1:] * e[:-1]) / max(float(np.mean(e * e)), 1e-300))
+    e = innovations[min(round(SETTLED / h), n // 2):]
+    heavy = float(np.mean(e**4) / (3.0 * max(float(np.mean(e * e)), 1e-150) ** 2))
     return Gust(math.exp(z[0]), math.exp(z[1]), width[0], width[1], -best.fun, -best.fun - without, torque.copy(),
-                index, whiteness)
+                index, heavy)
 
 
 def gauss_markov(shape: tuple[int, int], tau: float, period: float, rng: np.random.Generator) -> Array:

@@ -25,6 +25,10 @@ UNEXPLAINED = 0.4
 """And while free curves leave more than this of the share that they would leave of such a torque: of a short recording
 they follow most of what chance does, too."""
 
+JUMPS = 5.0
+"""Innovations of the torque's filter that are heavier than this are of an angle that jumps. A random torque has 1; a
+coupling that slips by 0.08 rad every two seconds 20 and more."""
+
 DRAWS = 20
 """Random torques from which that share is known."""
 
@@ -74,7 +78,7 @@ def _weighed(chains: Chains, final: Fit) -> Weighed | None:
     columns = np.hstack([*(hats(x)[0] for x in (theta, rate, speed, slope)), (speed * rate)[:, None]])
     known = [Unknown(u.name, u.mean, u.sd, u.low, u.high, None, u.log) for u in nominal_unknowns(chains, "arm")
              if u.name in final.values]
-    if g.gain <= 0.0 or follows_state(g.torque, columns) >= RANDOM:
+    if g.gain <= 0.0 or g.heavy > JUMPS or follows_state(g.torque, columns) >= RANDOM:
         return None
     rng = np.random.default_rng(0)
     curves = shapes(chains, "arm", final, known, torques=lambda n: gauss_markov((DRAWS, n), g.tau, s.period, rng))[0]
