@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import shutil
+import signal
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from aeropend_sim.parameters import ModelError
@@ -41,17 +43,35 @@ def whole(out: Path, files: Sequence[str]) -> Iterator[Path]:
         OutputError: the folder cannot be made or written.
     """
     made = not out.exists()
+    with ExitStack() as afterwards:
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=out, prefix=".writing_") as place:
+                yield Path(place)
+                afterwards.enter_context(_interrupts_wait())
+                for name in files:
+                    (Path(place) / name).replace(out / name)
+        except BaseException as error:  # Ctrl-C too
+            if made:
+                shutil.rmtree(out, ignore_errors=True)
+            if not isinstance(error, (OSError, ModelError)):
+                raise
+            why = error.strerror if isinstance(error, OSError) else error
+            raise OutputError(f"{out}: the results cannot be written: {why}; give another folder with --out or make "
+                              "room") from None
+
+
+@contextmanager
+def _interrupts_wait() -> Iterator[None]:
+    """Ctrl-C in here takes effect when it ends: what is begun, and takes a moment, is done."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread is ever interrupted
+        return
+    came = []
+    before = signal.signal(signal.SIGINT, lambda *_: came.append(True))
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=out, prefix=".writing_") as place:
-            yield Path(place)
-            for name in files:
-                (Path(place) / name).replace(out / name)
-    except BaseException as error:  # Ctrl-C too
-        if made:
-            shutil.rmtree(out, ignore_errors=True)
-        if not isinstance(error, (OSError, ModelError)):
-            raise
-        why = error.strerror if isinstance(error, OSError) else error
-        raise OutputError(f"{out}: the results cannot be written: {why}; give another folder with --out or make room"
-                          ) from None
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if came:
+        signal.raise_signal(signal.SIGINT)
