@@ -11,7 +11,8 @@ from aeropend_ident.gap.chain import Chains
 from aeropend_ident.gap.diagnosis import diagnose
 from aeropend_ident.gap.hypotheses import from_linear, linear_unknowns
 from aeropend_ident.gap.signals import from_arrays
-from aeropend_ident.gap.which import search
+from aeropend_ident.gap.unknowns import nominal_unknowns
+from aeropend_ident.gap.which import _swap, refit, search
 from aeropend_sim import rig
 from aeropend_sim.effects import CATALOGUE
 from aeropend_sim.parameters import SAMPLE_PERIOD
@@ -98,6 +99,22 @@ def test_a_second_parameter_is_found_wherever_it_is(id_, true):
     for name, value in true.items():
         full = f"{id_}.{name}"
         assert abs(findings.final.values[full] - value) < 4.0 * findings.final.sd[full] + 0.02 * abs(value)
+
+
+# --- two effects
+
+
+def test_what_only_stood_in_for_an_effect_gives_way_to_it():
+    chains = Chains(BENCH, [recording({"coulomb_friction": {}, "cable_torque": {}}, 4, 20.0)])
+    findings = search(chains, 2)["arm"]
+    right, wrong, *others = findings.found[0]
+    assert [right.hypothesis.name, findings.found[1][0].hypothesis.name] == ["coulomb_friction", "cable_torque"]
+    findings.found[0] = [wrong, right, *others]
+    findings.final = refit(chains, "arm", findings.effects, findings.final.values)
+    _swap(chains, findings, nominal_unknowns(chains, "arm"))
+    assert [h.name for h in findings.effects] == ["coulomb_friction", "cable_torque"]
+    assert findings.found[0][0].probability > 0.999
+    assert [w.probability for w in findings.found[0][1:]] == pytest.approx([0.0] * (len(others) + 1), abs=1e-3)
 
 
 # --- what is not in the catalogue

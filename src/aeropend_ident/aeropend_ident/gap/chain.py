@@ -312,6 +312,12 @@ def _suffix(k: int) -> str:
     return f"@{k}" if k else ""
 
 
+def of_recording(name: str) -> tuple[str, int]:
+    """A name without the suffix of its recording, and which recording that is."""
+    plain, _, k = name.partition("@")
+    return plain, int(k or 0)
+
+
 def smooth(x: Array, width: int) -> Array:
     """Centred moving mean (N,) over `width` samples, missing ones left out; 0 where there is nothing."""
     known = np.isfinite(x)

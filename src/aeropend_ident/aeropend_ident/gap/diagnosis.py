@@ -46,6 +46,7 @@ class Diagnosis:
     body: dict[str, object]
     misfit: Mapping[str, Array]
 
+
 Progress = Callable[[str, float], None]
 """Called with what is being done and the share (0..1) that is behind."""
 
@@ -121,13 +122,14 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
     undecided = told.not_separable(findings, told.UNDECIDED_UNKNOWN if chains.fit_nominal else told.UNDECIDED)
     tried = within(max(float(s.duty.max()) for s in recordings)) if chains.fit_nominal else EXPERIMENTS
     augmented = _augmented(model, values, torque, spikes)
+    rows = told.numbers(chains, values, sd)
     names = [c for c in CHANNELS if c in gap_before.rms]
     body: dict[str, object] = {
         "channels": {c: {"unit": CHANNELS[c], "gap": gap_before.rms[c], "floor": floors[c],
                          "gap_after": gap_after.rms[c]} for c in names},
         "where": {"place": place, "share": parts, "regions": where.regions(misfit, variables)},
         "which": {"verdict": verdict, "effects": effects, "candidates": candidates,
-                  "numbers": told.numbers(chains, values, sd),
+                  "numbers": rows,
                   "residuals": {channel: {"rms": check.rms[channel], "white": check.white[channel],
                                           "dependence": check.dependence}
                                 for check in settled.checks.values() for channel in check.rms},
@@ -138,7 +140,7 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
                    "closed": share, "low": low, "high": high},
     }
     if chains.fit_nominal:
-        body["identified"] = told.identified_model(chains, values, sd)
+        body["identified"] = told.identified_model(chains, values, sd, rows)
         model = with_values(model, identified.shared(base_values))
     progress("done", 1.0)
     return Diagnosis(model, augmented, recordings, before, after, body, {"misfit": misfit, **variables})

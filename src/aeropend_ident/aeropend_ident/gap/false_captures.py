@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.special import expit
 
 from aeropend_ident.gap.chain import Chains
 from aeropend_ident.gap.fit import Fit
@@ -33,8 +34,8 @@ def found(recordings: Sequence[Signals]) -> Weighed | None:
         return None
     name = "speed_spikes.rate"
     rate, sd = count / time, math.sqrt(count) / time
-    return Weighed(Hypothesis("speed_spikes"), Fit({name: rate}, {name: sd}, {}, {}, {}, 0.0, {}), gain,
-                   1.0 / (1.0 + math.exp(-min(gain, 500.0))))
+    fit = Fit({name: rate}, {name: sd}, {}, {}, {}, 0.0, {})
+    return Weighed(Hypothesis("speed_spikes"), fit, gain, float(expit(gain)))
 
 
 def gap(chains: Chains) -> float:

@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from aeropend_ident.gap.chain import Chain, Chains, mean_speed
+from aeropend_ident.gap.chain import Chain, Chains, mean_speed, of_recording
 from aeropend_ident.gap.fit import Fit, Search, Unknown, independent_samples
 from aeropend_ident.gap.gust import transition
 from aeropend_ident.gap.signals import Signals
@@ -284,7 +284,7 @@ def shapes(chains: Chains, block: str, base: Fit, known: Sequence[Unknown], *, a
     """
     chains = chains.head(MOST_AT_ANY_TIME if any_time else MOST_SAMPLES)
     begun = [Unknown(u.name, u.mean, u.sd, u.low, u.high, base.values[u.name], u.log) for u in known
-             if int(u.name.partition("@")[2] or 0) < len(chains.each)]
+             if of_recording(u.name)[1] < len(chains.each)]
     residuals = chains.residuals(block)
     search = Search(lambda values: residuals({**base.values, **values}), begun)
     jacobian = search.stacked(search.jacobian())
@@ -300,9 +300,8 @@ def shapes(chains: Chains, block: str, base: Fit, known: Sequence[Unknown], *, a
     if torques is not None:
         moved = [_driven(chain, chains.own(base.values, k), torques(len(chain.signals)))
                  for k, chain in enumerate(chains.each)]
-        parts = [(channel, int(which or 0)) for channel, _, which in (name.partition("@") for name in search.weight)]
         chance = np.concatenate([_rows(chains.each[k], channel, moved[k], len(moved[k]["theta"]))
-                                 for channel, k in parts], axis=1)
+                                 for channel, k in map(of_recording, search.weight)], axis=1)
     found = []
     for place in made[0]:
         curves = made[0][place][0][0]
@@ -311,8 +310,7 @@ def shapes(chains: Chains, block: str, base: Fit, known: Sequence[Unknown], *, a
             made = made[:1]
         columns = []
         for name in search.weight:
-            channel, _, which = name.partition("@")
-            k = int(which or 0)
+            channel, k = of_recording(name)
             columns.append(-_rows(chains.each[k], channel, made[k][place][0][1], count) if k < len(made)
                            else np.zeros((count, len(search.current[name]))))
         basis = np.concatenate(columns, axis=1)

@@ -67,11 +67,12 @@ def _over_runs(values: Sequence[float], sd: Sequence[float]) -> dict[str, object
             "run_to_run": spread}
 
 
-def identified_model(chains: Chains, values: Mapping[str, float], sd: Mapping[str, float]) -> dict[str, object]:
-    """What the nominal model of an unknown rig was identified from, and what of it stays open."""
+def identified_model(chains: Chains, values: Mapping[str, float], sd: Mapping[str, float],
+                     rows: Mapping[str, Mapping[str, object]]) -> dict[str, object]:
+    """What the nominal model of an unknown rig was identified from, and what of it (`rows`: `numbers`) stays open."""
     recordings = chains.recordings
-    open_ = [n for n, row in numbers(chains, values, sd).items() if not row["determined"]]
-    said: dict[str, object] = {"from": basis(recordings), "not_determined": open_}
+    said: dict[str, object] = {"from": basis(recordings),
+                               "not_determined": [n for n, row in rows.items() if not row["determined"]]}
     if "k3" in values and angle_only(recordings):
         said["lift"] = identified.lift(with_values(chains.model, chains.own(values, 0)), recordings)
     if ZERO in values:
@@ -80,8 +81,8 @@ def identified_model(chains: Chains, values: Mapping[str, float], sd: Mapping[st
 
 
 def candidates(findings: Mapping[str, Findings], values: Mapping[str, float], sd: Mapping[str, float],
-                torque: Weighed | None, spikes: Weighed | None, scorer: Scorer, gap_after: float
-                ) -> list[dict[str, object]]:
+               torque: Weighed | None, spikes: Weighed | None, scorer: Scorer, gap_after: float
+               ) -> list[dict[str, object]]:
     """Every hypothesis that was weighed, the most probable first; a found one with its intervals of the joint fit."""
     rows: dict[str, dict[str, object]] = {}
     for f in findings.values():
@@ -120,7 +121,7 @@ def not_separable(findings: Mapping[str, Findings], least: float = UNDECIDED) ->
 
 
 def next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[Weighed, Weighed]],
-                     values: Mapping[str, float], tried: Sequence[Excitation]) -> dict[str, object] | None:
+                    values: Mapping[str, float], tried: Sequence[Excitation]) -> dict[str, object] | None:
     """The experiment that would tell the closest pair apart; None where nothing is open."""
     if not pairs:
         return None

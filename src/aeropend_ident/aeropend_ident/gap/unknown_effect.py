@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.gap import false_captures
-from aeropend_ident.gap.chain import Chains
+from aeropend_ident.gap.chain import Chains, of_recording
 from aeropend_ident.gap.fit import Fit
 from aeropend_ident.gap.shape import Shape, shapes
 from aeropend_ident.gap.unknowns import free_swinging, nominal_unknowns
@@ -136,8 +136,8 @@ class Misfit:
 
 
 def _misfit(chains: Chains, channel: str, r: Array) -> Misfit:
-    name, _, k = channel.partition("@")
-    s = chains.each[int(k or 0)].signals
+    name, k = of_recording(channel)
+    s = chains.each[k].signals
     noise = float(np.sqrt(np.mean(s.pulses.sigma**2))) if name == "omega" and s.pulses else s.sigma[name]
     unseen = GOOD_ENOUGH**2 if chains.fit_nominal else NOTICEABLE  # the noise too is only what the recording shows
     return Misfit(float(np.mean(r * r)), noise, max(float(np.nanstd(s.channel(name))), noise), len(r), unseen)

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.special import expit
 
 from aeropend_ident.gap.chain import BLOCKS, Chains
 from aeropend_ident.gap.fit import Fit, Unknown, fit
@@ -145,8 +145,8 @@ def _search_block(chains: Chains, block: str, candidates: list[Hypothesis], wher
         best = rivals[0]
         matters = best.hypothesis.number or _material(here.current, best.fit) or strayed(chains, block, here.current)
         if swinging and findings.found:  # what leaves a narrow band seems to leave many independent samples
-            odds = [against(here.current, w.fit) + log_odds(w.hypothesis) for w in rivals]
-            rivals = [replace(w, probability=min(w.probability, _sure(x))) for w, x in zip(rivals, odds, strict=True)]
+            sure = [float(expit(against(here.current, w.fit) + log_odds(w.hypothesis))) for w in rivals]
+            rivals = [replace(w, probability=min(w.probability, p)) for w, p in zip(rivals, sure, strict=True)]
         if sum(w.probability for w in rivals) < 0.5 or not matters:
             findings.rivals = rivals
             break
@@ -184,7 +184,7 @@ def _swap(chains: Chains, findings: Findings, nominal: list[Unknown]) -> None:
             odds = log_odds(rival.hypothesis) - log_odds(findings.found[k][0].hypothesis)
             gain = f.evidence(counts) - findings.final.evidence(counts) + odds
             if gain > 0.0:
-                sure = _sure(gain)
+                sure = float(expit(gain))
                 others = [replace(w, probability=1.0 - sure if w is round_[0] else 0.0) for w in round_
                           if w is not rival]
                 findings.found[k] = [replace(rival, fit=f, gain=rival.gain + gain, probability=sure), *others]
@@ -236,10 +236,6 @@ def refit(chains: Chains, block: str, effects: Sequence[Hypothesis], start: Mapp
     """A part of the chain with these effects, fitted anew from where its values were."""
     unknowns = [*nominal_unknowns(chains, block), *(u for h in effects for u in h.starts[0])]
     return fit(chains.residuals(block), started(unknowns, start))
-
-
-def _sure(log_odds: float) -> float:
-    return 1.0 / (1.0 + math.exp(-min(max(log_odds, -500.0), 500.0)))
 
 
 def strayed(chains: Chains, block: str, f: Fit) -> bool:
