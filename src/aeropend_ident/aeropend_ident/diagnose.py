@@ -12,6 +12,7 @@ import shlex
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 from rich import box
@@ -134,8 +135,8 @@ def run_each(options: argparse.Namespace) -> int:
     commands = [_alone(options, bag, out / name) for bag, name in zip(options.bags, names)]
     rows = []
     try:
-        with many.cluster(options.dask) as client, progress(f"0 of {len(names)} recordings", len(names)) as show:
-            outcomes = many.diagnose_each(options.bags, commands, settings, options.jobs, client)
+        with (many.cluster(options.dask) as client, progress(f"0 of {len(names)} recordings", len(names)) as show,
+              closing(many.diagnose_each(options.bags, commands, settings, options.jobs, client)) as outcomes):
             for name, outcome in zip(names, outcomes):
                 if outcome.results is not None:
                     outcome.results.write(out / name, overwrite=options.overwrite)

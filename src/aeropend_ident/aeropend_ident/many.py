@@ -14,7 +14,7 @@ import threading
 import time
 import warnings
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -73,7 +73,7 @@ class Outcome:
 
 
 def diagnose_each(bags: Sequence[str], commands: Sequence[str], settings: Settings, jobs: int = 1,
-                  client: Any = None) -> Iterator[Outcome]:
+                  client: Any = None) -> Generator[Outcome, None, None]:
     """Diagnose recordings of rigs that have nothing to do with each other.
 
     A recording that cannot be used stops no other one. What is found depends neither on `jobs` nor on the cluster.
@@ -86,7 +86,8 @@ def diagnose_each(bags: Sequence[str], commands: Sequence[str], settings: Settin
         client: a `distributed.Client` (see `cluster`) whose workers do the work instead; None: processes.
 
     Yields:
-        One outcome a bag, in their order, each as soon as it and those before it are there.
+        One outcome a bag, in their order, each as soon as it and those before it are there. Who stops early closes it:
+        left to garbage collection, which may come in a thread that waits for the processes, they would never end.
     """
     tasks = _tasks(bags, commands, settings)
     if client is not None:

@@ -232,6 +232,24 @@ def test_an_interrupt_keeps_what_is_done(recordings, tmp_path):
     assert all(len(list((out / name).iterdir())) == 3 for name in folders)
 
 
+def test_an_interrupt_between_two_recordings_ends_the_work_at_once(here, recordings, tmp_path, monkeypatch):
+    """Left to garbage collection, which may come in a thread that waits for them, the processes would never end."""
+    begun, real = [], many.diagnose_each
+
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    def kept(*arguments):
+        begun.append(real(*arguments))  # nothing that is held is garbage
+        return begun[0]
+
+    monkeypatch.setattr(many, "diagnose_each", kept)
+    monkeypatch.setattr(many, "row", interrupt)
+    code, _, complained = here("--each", recordings[0], recordings[0], "--out", tmp_path / "out", "--jobs", 1)
+    assert (code, complained) == (130, f"diagnose: interrupted; 1 of 2 verdicts are in {tmp_path / 'out'}\n")
+    assert begun[0].gi_frame is None
+
+
 @pytest.mark.parametrize(("bags", "names"), [
     (["a", "b/c", "d.mcap", "e.1"], ["a", "c", "d", "e.1"]),
     (["x/run", "y/run", "z"], ["x_run", "y_run", "z"]),
