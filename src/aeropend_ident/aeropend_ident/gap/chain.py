@@ -11,11 +11,12 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.gap.signals import Signals
+from aeropend_ident.gap.signals import Signals, apart
 from aeropend_sim import actuator, dynamics, sensing
 from aeropend_sim.effects import CATALOGUE
 from aeropend_sim.parameters import Model
@@ -137,7 +138,8 @@ class Chain:
         s = self.signals
         self.described, self.beyond = dict(values), np.zeros(len(s))
         if s.has("v_a"):
-            self.beyond = structure(s.v_a - self.actuator(values), round(0.05 / s.period), s.sigma["v_a"])
+            self.beyond = apart(partial(structure, width=round(0.05 / s.period), sigma=s.sigma["v_a"]),
+                                s.v_a - self.actuator(values), s.train)
         self.voltage = self._voltage_fed({})
 
     def _voltage_fed(self, values: Values) -> Array:
@@ -193,12 +195,15 @@ class Chain:
         s = self.signals
         _, omega, angle = self.motor(values)
         if s.pulses is not None and (~s.pulses.false).sum() > 2:
-            p = s.pulses
-            error = (p.omega - mean_speed(angle, p.time, p.period, s.period))[~p.false]
-            middle = (p.time - 0.5 * p.period)[~p.false]
-            omega = omega + np.interp(np.arange(len(s)) * s.period, middle, error)
+            p = s.pulses.of(~s.pulses.false)
+            error = p.omega - mean_speed(angle, p.time, p.period, s.period)
+            t, middle = np.arange(len(s)) * s.period, p.time - 0.5 * p.period
+            omega[s.train:] += np.interp(t[s.train:], middle, error)
+            if known := int(np.searchsorted(p.index, s.train)):
+                omega[:s.train] += np.interp(t[:s.train], middle[:known], error[:known])
         elif s.has("omega"):
-            omega = omega + structure(s.true_speed - omega, round(0.02 / s.period), s.sigma["omega"])
+            omega = omega + apart(partial(structure, width=round(0.02 / s.period), sigma=s.sigma["omega"]),
+                                  s.true_speed - omega, s.train)
         self.speed = np.maximum(omega, 0.0)
 
     # --- arm: speed -> angle

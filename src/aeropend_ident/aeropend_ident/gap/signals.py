@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +57,14 @@ class Pulses:
     sigma: Array
     false: NDArray[np.bool_]
 
+    def of(self, which: NDArray[np.bool_]) -> Pulses:
+        """Those of them, by mask (M,)."""
+        return Pulses(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    def then(self, others: Pulses) -> Pulses:
+        """These, and the others after them."""
+        return Pulses(*(np.concatenate([getattr(self, f.name), getattr(others, f.name)]) for f in fields(self)))
+
 
 @dataclass(frozen=True)
 class Signals:
@@ -90,8 +100,7 @@ class Signals:
         """The first n samples."""
         p = self.pulses
         if p is not None:
-            early = p.index < n
-            p = Pulses(*(getattr(p, f.name)[early] for f in fields(p)))
+            p = p.of(p.index < n)
         return replace(self, duty=self.duty[:n], theta=self.theta[:n], omega=self.omega[:n], i_a=self.i_a[:n],
                        v_a=self.v_a[:n], pulses=p, false_speed=self.false_speed[:n], train=min(self.train, n))
 
@@ -161,13 +170,14 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
         raise RecordingError(f"{name}: no duty was recorded (armature.percentage or duty_command); "
                              "without it the model has no input")
     duty = _held(columns["duty"])
+    train = max(1, round(n * (1.0 - held_out)))
     columns, said = dict(columns), [*notes]
     for channel in ("omega", "i_a", "v_a"):
         x = columns[channel][np.isfinite(columns[channel])]
         if len(x) and np.ptp(x) == 0.0 and np.ptp(duty) > STILL:
             columns[channel] = np.full(n, np.nan)
             said.append(f"{channel} is {x[0]:g} {CHANNELS[channel]} all the time, whatever the duty: it is left out")
-    said += _left_out(columns)
+    said += _left_out(columns, train)
     if np.ptp(columns["theta"][np.isfinite(columns["theta"])]) == 0.0:
         raise RecordingError(f"{name}: the arm angle stays the same all the time: the sensor or the arm is stuck, "
                              "so no verdict is possible")
@@ -177,36 +187,42 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
         columns["i_a"] = columns["i_a"].copy()
         columns["i_a"][np.minimum(near, n - 1)] = np.nan
     lsb = {"theta": "angle", "i_a": "current", "v_a": "voltage"}
-    sigma = {"omega": max(sensing["speed_noise"], _noise_of(columns["omega"]))}
+    sigma = {"omega": max(sensing["speed_noise"], _noise_of(columns["omega"][:train]))}
     for channel, key in lsb.items():
         stated = math.hypot(sensing[f"{key}_noise"], sensing[f"{key}_lsb"] / math.sqrt(12.0))
-        seen = _noise_of(columns[channel])
+        seen = _noise_of(columns[channel][:train])
         sigma[channel] = seen if seen > 2.0 * stated else stated  # quantisation spoils what is seen of a small noise
     if np.ptp(duty) < STILL and np.nanstd(columns["theta"]) < 2.0 * sigma["theta"]:
         raise RecordingError(f"{name}: nothing happens in it, duty and angle stay where they are, so no verdict is "
                              "possible; record while `excite` runs")
-    train = max(1, round(n * (1.0 - held_out)))
     pulses = None
     if sensing["speed_pulses_per_rev"] > 0.0 and np.isfinite(columns["omega"]).any():
         pulses = find_pulses(columns["omega"], period, sensing)
-    false_speed = _held_false(pulses, n) if pulses else _outliers(columns["omega"], sigma["omega"])
+        pulses = find_pulses(columns["omega"][:train], period, sensing).then(pulses.of(pulses.index >= train))
+    false_speed = _held_false(pulses, n) if pulses else apart(
+        lambda x: _outliers(x, sigma["omega"]), columns["omega"], train)
     return Signals(period, duty, columns["theta"], columns["omega"], columns["i_a"], columns["v_a"], sigma, pulses,
                    false_speed, train, tuple(said))
 
 
-def _left_out(columns: dict[str, Array]) -> list[str]:
+def apart(of: Callable[[Array], NDArray[Any]], x: Array, train: int) -> NDArray[Any]:
+    """`of` a channel x (N,), but what models are fitted to is worked out from itself alone."""
+    return np.concatenate([of(x[:train]), of(x)[train:]])
+
+
+def _left_out(columns: dict[str, Array], train: int) -> list[str]:
     """Take readings at the end of their range, and single ones that jump out, from the columns; says which."""
     said = []
     for channel, unit in CHANNELS.items():
         x = columns[channel]
         if channel != "omega":  # a speed is held between its pulses
-            limit = saturated(x, smooth=channel == "theta")
+            limit = apart(partial(saturated, smooth=channel == "theta"), x, train)
             if limit.any():
                 ends = " and ".join(f"{e:g}" for e in np.unique(x[limit]))
                 said.append(f"{channel} sits at {ends} {unit}, the end of its range, for {100.0 * limit.mean():.1f} % "
                             "of the time: it is left out there")
             x = np.where(limit, np.nan, x)
-        alone = jumps_out(x, _noise_of(x))
+        alone = apart(partial(jumps_out, sigma=_noise_of(x[:train])), x, train)
         if alone.any():
             said.append(f"{channel}: {alone.sum()} single readings jump out and are left out")
         columns[channel] = np.where(alone, np.nan, x)

@@ -138,6 +138,8 @@ class Misfit:
 def _misfit(chains: Chains, channel: str, r: Array) -> Misfit:
     name, k = of_recording(channel)
     s = chains.each[k].signals
-    noise = float(np.sqrt(np.mean(s.pulses.sigma**2))) if name == "omega" and s.pulses else s.sigma[name]
+    noise = s.sigma[name]
+    if name == "omega" and s.pulses:
+        noise = float(np.sqrt(np.mean(s.pulses.sigma[s.pulses.index < s.train] ** 2)))
     unseen = GOOD_ENOUGH**2 if chains.fit_nominal else NOTICEABLE  # the noise too is only what the recording shows
-    return Misfit(float(np.mean(r * r)), noise, max(float(np.nanstd(s.channel(name))), noise), len(r), unseen)
+    return Misfit(float(np.mean(r * r)), noise, max(float(np.nanstd(s.channel(name)[:s.train])), noise), len(r), unseen)
