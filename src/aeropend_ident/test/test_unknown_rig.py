@@ -220,6 +220,13 @@ def test_chance_is_not_taken_for_what_it_looks_like():
     assert verdict(signals_from(read, BENCH.sensing))["which"]["effects"] == ["gust"]
 
 
+def test_what_a_misled_model_leaves_is_not_taken_for_chance():
+    """An arm that turns over and over: the search for its numbers ends elsewhere, and no effect is to blame."""
+    _, read = unknown(7)
+    assert np.ptp(read.theta) > 8.0 * math.pi
+    assert verdict(signals_from(read, BENCH.sensing))["which"]["effects"] == []
+
+
 def test_thrifty_chains_give_what_others_give_and_count():
     _, read = unknown(5, duration=6.0)
     signals = signals_from(read, BENCH.sensing)
