@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """An effect of another form than the catalogue's, beside one elsewhere that could borrow its gap."""
 
+import ast
+from pathlib import Path
+
 import pytest
 
 from aeropend_ident.gap.diagnosis import diagnose
 from aeropend_ident.gap.signals import from_arrays
 from aeropend_sim.parameters import SAMPLE_PERIOD, load
-from blind import cases
+from blind import cases, plant
 
 BENCH = load("bench")
 
@@ -20,3 +23,15 @@ def test_a_lag_is_placed_by_what_curves_at_its_place_explain(effect, place, seed
     # so far from the catalogue's form it may pass for unknown, never for the lag of another place
     assert body["which"]["verdict"] in (effect, "unknown")
     assert body["where"]["place"] == place
+
+
+def test_the_plant_of_the_blind_check_shares_nothing_with_ours():
+    imported = set()
+    for node in ast.walk(ast.parse(Path(plant.__file__).read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            imported |= {name.name for name in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0
+            imported.add(node.module)
+    assert {name.partition(".")[0] for name in imported} <= {"__future__", "collections", "math", "numba", "numpy",
+                                                             "scipy", "typing"}

@@ -105,7 +105,8 @@ def numbers(body: Mapping[str, Any]) -> str:
     texts = [f"{n} = {row['value']:.4g} ({row['low']:.4g} to {row['high']:.4g}"
              + (f", run to run {row['run_to_run']:.2g})" if row.get("run_to_run") else ")") for n, row in known.items()]
     if hangs := body["identified"].get("hangs_at"):
-        texts.append(f"hangs at {hangs['value']:.3g} rad")
+        texts.append(f"hangs at {hangs['value']:.3g} rad"
+                     + (f" (run to run {hangs['run_to_run']:.2g})" if hangs.get("run_to_run") else ""))
     if lift := body["identified"].get("lift"):
         texts.append(f"lift up to {lift['rad_per_s2'][-1]:.3g} rad/s² at a duty of {lift['duty'][-1]:.2g}, none below "
                      f"{lift['dead_zone']:.2g}, behind a lag of {lift['lag_s']:.2g} s")

@@ -47,6 +47,14 @@ def test_two_effects_in_different_places_are_both_found():
     assert set(body["which"]["effects"]) == {"coulomb_friction", "brush_drop"}
 
 
+@pytest.mark.parametrize(("friction", "drop", "first"), [(4.0, 0.05, "coulomb_friction"), (0.2, 0.8, "brush_drop")])
+def test_the_effect_that_opens_more_of_the_gap_comes_first(friction, drop, first):
+    effects = {"coulomb_friction": {"accel": friction}, "brush_drop": {"v_brush": drop}}
+    body = diagnose(BENCH, [recorded(71, effects)], 2).body
+    assert set(body["which"]["effects"]) == set(effects)
+    assert body["which"]["verdict"] == body["which"]["effects"][0] == first
+
+
 def test_two_effects_in_one_place_are_both_found():
     body = diagnose(BENCH, [recorded(72, {"coulomb_friction": {}, "thrust_lag": {}})], 2).body
     assert set(body["which"]["effects"]) == {"coulomb_friction", "thrust_lag"}

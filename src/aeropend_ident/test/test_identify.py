@@ -8,8 +8,9 @@ import pytest
 from commands import Command
 from rigs import BENCH
 
-from aeropend_sim import rig
+from aeropend_sim import parameters, rig
 from aeropend_sim.excitation import Excitation
+from aeropend_sim.parameters import Model
 
 KEYS = ["format", "method", "terms", "equations", "sigma", "held_out_mse", "seconds"]
 
@@ -90,3 +91,16 @@ def test_a_bag_with_a_gap_is_refused(bags, tmp_path):
     kept = [m for m in content.messages if not 3_000_000_000 < m[2] - start < 3_020_000_000]
     gap = bags.write(tmp_path / "gap", bags.Content(kept, content.arrays))
     assert "missing" in refused(gap, "--out", tmp_path / "out")
+
+
+def test_the_model_file_is_asked_for_the_measurement_chain_alone(bag, tmp_path):
+    numbers, effects = {n: 1.3 * x for n, x in BENCH.model.items()}, {"coulomb_friction": {"accel": 0.8}}
+    other = Model("other", numbers, BENCH.sensing, effects)
+    parameters.save(other, tmp_path / "other.yaml", "numbers and an effect that are not the rig's")
+    found = []
+    for model in ("bench", tmp_path / "other.yaml"):
+        result = run(bag, "--method", "weak", "--model", model, "--out", tmp_path / f"out_{len(found)}")
+        assert result.returncode == 0, result.stderr
+        found.append(json.loads((tmp_path / f"out_{len(found)}" / "identified.json").read_text()))
+    assert found[0]["equations"] == found[1]["equations"]
+    assert found[0]["sigma"] == found[1]["sigma"]

@@ -24,6 +24,7 @@ from aeropend_ident.gap.thrift import ThriftyChains
 from aeropend_ident.gap.unknown_rig import free_swings, grid, noise, reading_sigma, resolution, signals_from
 from aeropend_ident.recording import Recording, RecordingError
 from aeropend_sim import dynamics, rig
+from aeropend_sim.excitation import Excitation
 from aeropend_sim.parameters import SAMPLE_PERIOD, Model, load
 
 DEGREE = math.radians(1.0)
@@ -170,6 +171,15 @@ def test_runs_that_differ_are_no_effect_and_their_spread_is_told():
     assert gravity["run_to_run"] == pytest.approx(1.53, rel=0.1)
 
 
+def test_where_it_hangs_is_each_runs_own():
+    runs = [let_go(8.0, first=1.0, zero=zero, seed=k) for k, zero in enumerate((0.0, 0.1, -0.05))]
+    body = verdict(*(signals_from(recording(*run), BENCH.sensing) for run in runs))
+    assert body["which"]["effects"] == []
+    hangs = body["identified"]["hangs_at"]
+    assert [r["value"] for r in hangs["runs"]] == pytest.approx([0.0, 0.1, -0.05], abs=0.005)
+    assert hangs["run_to_run"] == pytest.approx(0.076, rel=0.1)
+
+
 def test_an_arm_that_thrust_holds_cannot_be_diagnosed_without_the_command():
     parts = [let_go(4.0, first=a, held=0.2, damping=1.5)[1] for a in (0.6, 0.7, 0.5)]
     theta = np.concatenate(parts) + math.radians(100.0)
@@ -179,17 +189,22 @@ def test_an_arm_that_thrust_holds_cannot_be_diagnosed_without_the_command():
         signals_from(recording(np.arange(400) / 20.0, np.repeat([0.0, 0.4, 0.2, 0.5], 100)), BENCH.sensing)
 
 
-def unknown(seed, effects=None, duration=30.0, factor=0.5, **kept):
+def unknown(seed, effects=None, duration=30.0, factor=0.5, lever=1.0, **kept):
     """A recording of a rig with numbers off by a factor; of its channels those kept are there."""
     rng = np.random.default_rng(seed)
     model = drawn_rig(seed, effects or {}, 0.0)
     numbers = {k: v * math.exp(factor * rng.uniform(-1.0, 1.0)) for k, v in model.model.items()}
     model = replace(model, model={**numbers, "k1": model.model["k1"], "L_over_J": model.model["L_over_J"] *
-                                  numbers["mgd_over_J"] / model.model["mgd_over_J"]})
+                                  lever * numbers["mgd_over_J"] / model.model["mgd_over_J"]})
     duty = steps(duration, seed, 0.45)
     columns, _ = rig.record(model, duty, seed)
     t = np.arange(len(duty)) * SAMPLE_PERIOD
     return model, recording(t, columns["theta"], duty, **{c: columns[c] for c in kept})
+
+
+def test_the_lever_is_each_runs_own():
+    read = [unknown(4, duration=15.0, lever=lever)[1] for lever in (1.0, 1.2, 0.9)]
+    assert verdict(*(signals_from(r, BENCH.sensing) for r in read))["which"]["verdict"] == "none"
 
 
 def test_angle_and_command_alone_name_an_effect_in_a_rig_that_nobody_knows():
@@ -250,6 +265,19 @@ def test_a_search_that_is_cut_short_says_so(monkeypatch):
     json.dumps(result.body, allow_nan=False)
 
 
+@pytest.mark.parametrize(("effect", "size"), [("thrust_lag", {"tau": 0.01}), ("thrust_exponent", {"n": 1.97}),
+                                              ("command_delay", {"delay": 0.004})])
+def test_what_the_nominal_model_can_take_is_not_claimed(effect, size):
+    _, read = unknown(4, {effect: size}, duration=20.0)
+    assert verdict(signals_from(read, BENCH.sensing))["which"]["effects"] == []
+
+
+def test_the_experiment_advised_asks_for_no_more_duty_than_there_was():
+    _, read = unknown(6, {"cable_torque": {}})
+    advised = verdict(signals_from(read, BENCH.sensing))["which"]["next_experiment"]["excite"]
+    assert 0.0 < Excitation(**advised).series().max() <= np.max(read.duty)
+
+
 @pytest.mark.parametrize("top", [0.003, 0.264, 1.0])
 def test_an_experiment_drives_an_unknown_rig_no_harder_than_it_was_driven(top):
     for experiment in within(top):
@@ -265,6 +293,12 @@ def test_all_channels_give_the_numbers_of_a_rig_that_nobody_knows():
         assert row["determined"]
         assert row["value"] == pytest.approx(model.model[name], rel=0.03)
     assert not body["which"]["numbers"]["K_t"]["determined"]  # only K_t over J_m shows
+
+
+@pytest.mark.parametrize("effect", ["brush_drop", "coulomb_friction"])
+def test_all_channels_show_effects_on_top(effect):
+    _, read = unknown(4, {effect: {}}, duration=20.0, omega=True, i_a=True, v_a=True)
+    assert verdict(signals_from(read, BENCH.sensing))["which"]["effects"] == [effect]
 
 
 def bag(path, t, theta):

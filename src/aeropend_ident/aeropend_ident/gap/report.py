@@ -277,6 +277,8 @@ def _identified(doc: Any) -> dict[str, Any] | None:
     spread = [f"{name} by {quantity(n['run_to_run'], PARAMETERS[f'model.{name}'].unit.replace('-', ''), 2)}"
               for name, n in doc["which"]["numbers"].items() if n.get("run_to_run")]
     hangs, lift = identified.get("hangs_at"), identified.get("lift")
+    if hangs and hangs.get("run_to_run"):
+        spread.append(f"where the arm hangs by {quantity(hangs['run_to_run'], 'rad', 2)}")
     curve = (f"up to {quantity(lift['rad_per_s2'][-1], 'rad/s²')} at a duty of {lift['duty'][-1]:.2f}, none below "
              f"{lift['dead_zone']:.2f}, behind a lag of {quantity(lift['lag_s'], 's', 2)}" if lift else "")
     return {"basis": identified["from"], "open": identified["not_determined"], "spread": ", ".join(spread),

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from aeropend_ident.gap import experiment, identified
-from aeropend_ident.gap.chain import BLOCKS, Chains, with_values
+from aeropend_ident.gap.chain import BLOCKS, Chains, of_recording, with_values
 from aeropend_ident.gap.fit import Unknown
 from aeropend_ident.gap.joint import Z95, neutral
 from aeropend_ident.gap.shrink import Scorer
@@ -52,14 +52,17 @@ def numbers(chains: Chains, values: Mapping[str, float], sd: Mapping[str, float]
         else:
             between = _interval(value, spread, u.low, u.high)
         rows[n] = {"nominal": nominal[n], **between, "determined": known and spread < DETERMINED * prior}
-        runs = [n, *(f"{n}@{k}" for k in range(1, len(chains.each)))]
-        if known and len(runs) > 1 and runs[-1] in values:
-            rows[n] |= _over_runs([values[r] for r in runs], [sd[r] for r in runs])
+        if known:
+            rows[n] |= _over_runs(n, values, sd)
     return rows
 
 
-def _over_runs(values: Sequence[float], sd: Sequence[float]) -> dict[str, object]:
-    """A number that each run has its own of: mean, values, and how much more they scatter than they are unsure."""
+def _over_runs(name: str, of_all: Mapping[str, float], sd_of_all: Mapping[str, float]) -> dict[str, object]:
+    """A number, if each run has its own: mean, values, and how much more they scatter than they are unsure."""
+    runs = sorted((n for n in of_all if of_recording(n)[0] == name), key=lambda n: of_recording(n)[1])
+    if len(runs) < 2:
+        return {}
+    values, sd = [of_all[r] for r in runs], [sd_of_all[r] for r in runs]
     spread = math.sqrt(max(float(np.var(values, ddof=1)) - float(np.mean(np.square(sd))), 0.0))
     mean, unsure = float(np.mean(values)), math.sqrt(float(np.var(values, ddof=1)) / len(values))
     unsure = max(unsure, math.sqrt(float(np.sum(np.square(sd)))) / len(sd))
@@ -76,7 +79,7 @@ def identified_model(chains: Chains, values: Mapping[str, float], sd: Mapping[st
     if "k3" in values and angle_only(recordings):
         said["lift"] = identified.lift(with_values(chains.model, chains.own(values, 0)), recordings)
     if ZERO in values:
-        said["hangs_at"] = _interval(values[ZERO], sd[ZERO])
+        said["hangs_at"] = _interval(values[ZERO], sd[ZERO]) | _over_runs(ZERO, values, sd)
     return said
 
 
