@@ -135,19 +135,23 @@ class Chain:
 
     def feed_motor(self, values: Values) -> None:
         """Take the voltage that feeds the motor from the measured one, described by the actuator with these values."""
-        s = self.signals
-        self.described, self.beyond = dict(values), np.zeros(len(s))
-        if s.has("v_a"):
-            self.beyond = apart(partial(structure, width=round(0.05 / s.period), sigma=s.sigma["v_a"]),
-                                s.v_a - self.actuator(values), s.train)
+        self.described, self.beyond = dict(values), self._beyond(values)
         self.voltage = self._voltage_fed({})
+
+    def _beyond(self, values: Values) -> Array:
+        """What of the measured voltage (N,) the actuator with these values does not describe, without the noise."""
+        s = self.signals
+        if not s.has("v_a"):
+            return np.zeros(len(s))
+        clean = partial(structure, width=round(0.05 / s.period), sigma=s.sigma["v_a"])
+        return apart(clean, s.v_a - self.actuator(values), s.train)
 
     def _voltage_fed(self, values: Values) -> Array:
         """What feeds the motor; a delay in `values` says when in its hold a voltage changed."""
         s = self.signals
         late = {k: x for k, x in values.items() if k == DELAY}
         acting = {**self.described, **late}
-        v = self._voltage(acting, actuator.acting_voltage) + self.beyond
+        v = self._voltage(acting, actuator.acting_voltage) + (self._beyond(acting) if late else self.beyond)
         delay = self.valued(acting).effects.get("command_delay", {}).get("delay", 0.0)
         early = np.arange(len(s)) < math.floor(delay / s.period + 1e-9)  # set by duties from before the recording
         return np.where(early & np.isfinite(s.v_a), s.v_a, v)
