@@ -47,6 +47,15 @@ def test_the_current_places_it_within_the_period(periods):
     assert motor.final.scale["i_a"] < 1.05
 
 
+def test_it_is_found_under_a_duty_that_changes_all_the_time():
+    """Then what the voltage shows beyond its description without a delay is nothing of the voltage with one."""
+    duty = 0.35 + 0.2 * np.sin(2.0 * np.pi * 1.5 * SAMPLE_PERIOD * np.arange(round(20.0 / SAMPLE_PERIOD)))
+    columns, _ = rig.record(drawn_rig(4, {"command_delay": {"delay": 0.04}}), duty, 4)
+    findings = search(Chains(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)]), 2)
+    assert [h.name for f in findings.values() for h in f.effects] == ["command_delay"]
+    assert findings["motor"].final.values["command_delay.delay"] == pytest.approx(0.04, abs=1e-4)
+
+
 # --- unknowns in which an effect is linear
 
 
