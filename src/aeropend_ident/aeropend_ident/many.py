@@ -10,7 +10,6 @@ import asyncio
 import csv
 import logging
 import signal
-import threading
 import time
 import warnings
 from collections import Counter, deque
@@ -25,7 +24,7 @@ from threadpoolctl import threadpool_limits
 
 from aeropend_ident.gap.diagnosis import diagnose
 from aeropend_ident.gap.signals import Signals
-from aeropend_ident.output import OutputError
+from aeropend_ident.output import OutputError, on_interrupt
 from aeropend_ident.recording import RecordingError
 from aeropend_ident.results import Results, document
 from aeropend_ident.usable import signals_of
@@ -100,7 +99,7 @@ def diagnose_each(bags: Sequence[str], commands: Sequence[str], settings: Settin
     try:
         # each is read when a worker is about to want it: hundreds need not be in memory at once
         with Parallel(jobs, return_as="generator", batch_size=1, max_nbytes=None) as parallel:
-            with _without_interrupt():
+            with on_interrupt(signal.SIG_IGN):  # they never hear of Ctrl-C, which goes to all: this one ends them
                 list(parallel([delayed(int)()]))
             for outcome in parallel(delayed(_examine)(task) for task in tasks):
                 done += 1
@@ -108,19 +107,6 @@ def diagnose_each(bags: Sequence[str], commands: Sequence[str], settings: Settin
     except BrokenProcessPool:
         for bag in bags[done:]:
             yield Outcome(bag, None, f"{bag}: not diagnosed: {KILLED}; try fewer --jobs")
-
-
-@contextmanager
-def _without_interrupt() -> Iterator[None]:
-    """Processes that start in here never hear of Ctrl-C, which goes to all: the one that waits for them ends them."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _on_cluster(client: Any, tasks: Iterator[_Task]) -> Iterator[Outcome]:

@@ -7,7 +7,7 @@ import shutil
 import signal
 import tempfile
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -62,16 +62,23 @@ def whole(out: Path, files: Sequence[str]) -> Iterator[Path]:
 
 
 @contextmanager
-def _interrupts_wait() -> Iterator[None]:
-    """Ctrl-C in here takes effect when it ends: what is begun, and takes a moment, is done."""
+def on_interrupt(handler: Callable[[int, object], object] | signal.Handlers) -> Iterator[None]:
+    """What Ctrl-C does in here; nothing changes in another thread than the main one, which alone is interrupted."""
     if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread is ever interrupted
+        yield
         return
-    came = []
-    before = signal.signal(signal.SIGINT, lambda *_: came.append(True))
+    before = signal.signal(signal.SIGINT, handler)
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def _interrupts_wait() -> Iterator[None]:
+    """Ctrl-C in here takes effect when it ends: what is begun, and takes a moment, is done."""
+    came = []
+    with on_interrupt(lambda *_: came.append(True)):
+        yield
     if came:
         signal.raise_signal(signal.SIGINT)

@@ -151,7 +151,8 @@ class Chain:
         s = self.signals
         late = {k: x for k, x in values.items() if k == DELAY}
         acting = {**self.described, **late}
-        v = self._voltage(acting, actuator.acting_voltage) + (self._beyond(acting) if late else self.beyond)
+        v = self._voltage(acting, actuator.acting_voltage)
+        v = v + (self.beyond if acting == self.described else self._beyond(acting))
         delay = self.valued(acting).effects.get("command_delay", {}).get("delay", 0.0)
         early = np.arange(len(s)) < math.floor(delay / s.period + 1e-9)  # set by duties from before the recording
         return np.where(early & np.isfinite(s.v_a), s.v_a, v)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from aeropend_ident.gap import false_captures, identified, joint, random_torque, shrink, told, unknown_effect, where
-from aeropend_ident.gap.chain import PLACE_OF_NUMBER, Chains, with_values
+from aeropend_ident.gap.chain import PLACE_OF_NUMBER, Chains, of_recording, with_values
 from aeropend_ident.gap.experiment import EXPERIMENTS, within
 from aeropend_ident.gap.hypotheses import Hypothesis
 from aeropend_ident.gap.joint import neutral
@@ -175,7 +175,7 @@ def _left(findings: Mapping[str, Findings], torque: bool) -> dict[str, float]:
     for block, f in findings.items():
         for channel, r in f.final.residuals.items():
             if not (torque and block == "arm"):
-                name = channel.partition("@")[0]
+                name = of_recording(channel)[0]
                 left[name] = max(left.get(name, 0.0), float(np.sqrt(np.mean(r * r))))
     return left
 
@@ -186,7 +186,7 @@ def _unexplained(findings: Mapping[str, Findings], after: shrink.Gap, floors: Ma
     left: dict[str, float] = {}
     for f in findings.values():
         for channel, r in f.final.residuals.items():
-            name = channel.partition("@")[0]
+            name = of_recording(channel)[0]
             excess = float(np.mean(r * r)) - GOOD_ENOUGH**2
             if excess > 0.0 and name in after.spread:
                 left[home[name]] = excess * (floors[name] / after.spread[name]) ** 2 / len(after.spread)

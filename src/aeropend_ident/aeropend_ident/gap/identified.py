@@ -17,7 +17,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.gap.chain import BLOCKS, Chain, Chains, with_values
+from aeropend_ident.gap.chain import BLOCKS, Chain, Chains, of_recording, with_values
 from aeropend_ident.gap.fit import Fit, Unknown, fit
 from aeropend_ident.gap.signals import Signals
 from aeropend_ident.gap.thrift import ThriftyChains
@@ -248,7 +248,7 @@ def shared(values: Mapping[str, float]) -> dict[str, float]:
     out: dict[str, list[float]] = {}
     for name, value in values.items():
         if not name.startswith("initial."):
-            out.setdefault(name.partition("@")[0], []).append(value)
+            out.setdefault(of_recording(name)[0], []).append(value)
     return {name: float(np.mean(all_)) for name, all_ in out.items()}
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aeropend_ident.gap import identified
-from aeropend_ident.gap.chain import Chains
+from aeropend_ident.gap.chain import Chains, of_recording
 from aeropend_ident.gap.fit import Fit, Unknown, fit, independent_samples, screen
 from aeropend_ident.gap.hypotheses import Hypothesis, from_linear, linear_unknowns, log_odds
 from aeropend_ident.gap.shape import shapes
@@ -242,7 +242,7 @@ def adopted(known: list[Unknown], hypothesis: Hypothesis, start: int = 0) -> lis
 def mean_square(f: Fit, block: str) -> float:
     """Mean square residual of a fit in the channels of a block, in units of a reading's noise."""
     home = {"actuator": ("v_a",), "motor": ("i_a", "omega"), "arm": ("theta",)}[block]
-    own = [r for k, r in f.residuals.items() if k.partition("@")[0] in home]
+    own = [r for k, r in f.residuals.items() if of_recording(k)[0] in home]
     return float(np.mean(np.concatenate(own) ** 2)) if own else 0.0
 
 
