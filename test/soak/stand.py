@@ -335,9 +335,9 @@ class Stand:
         code = recorder.stop()
         self.check("record ends with exit code 0", code == 0, code)
         said = recorder.output.rpartition(" recorded: ")[2]
-        counts = {name: int(count) for name, count in re.findall(r"(\w+) (\d+)[,;]", said)}
-        own = re.search(r"; (\w+) lost(?:, (\d+) of them in the first second)?", said)
-        lost, joining = (-1, 0) if own is None else (int(own[1].replace("none", "0")), int(own[2] or 0))
+        counts = {name: int(count) for name, count in re.findall(r"(\w+) (\d+)", said.partition(";")[0])}
+        own = re.search(r"; (\w+) lost(?: \((.*)\))?(?:, (\d+) of them in the first second)?", said)
+        lost, joining = (-1, 0) if own is None else (int(own[1].replace("none", "0")), int(own[3] or 0))
         try:
             read = recording.read(self.bag)
         except recording.RecordingError as error:
@@ -348,7 +348,8 @@ class Stand:
         same = all(counts.get(name) == len(stamps) for name, stamps in there.items())
         self.check("the bag holds what record says", same, counts)
         gone = self.missing(there)
-        counted = f"{gone} missing, {lost} counted, {joining} of them in the first second of a publisher"
+        which = f" ({own[2]})" if own and own[2] else ""
+        counted = f"{gone} missing, {lost} counted{which}, {joining} of them in the first second of a publisher"
         if lossy:
             self.check("all that was heard is in the bag, or counted as lost", gone <= lost, counted)
         else:

@@ -363,9 +363,9 @@ class Record(Node):
             return f"{self._out}: no message was received; the bag is empty"
         span = (end - start) / 1e9
         parts = [f"{self.shorten(tap.topic)} {tap.count}" for tap in self.taps() if tap.count]
-        lost, joining = sum(tap.lost for tap in self.taps()), sum(tap.lost_joining for tap in self.taps())
-        when = f", {joining} of them in the first second of a publisher" if joining else ""
-        return f"{self._out}: {span:.1f} s recorded: {', '.join(parts)}; {lost or 'none'} lost{when}"
+        lost = {self.shorten(tap.topic): tap.lost for tap in self.taps()}
+        joining = sum(tap.lost_joining for tap in self.taps())
+        return f"{self._out}: {span:.1f} s recorded: {', '.join(parts)}; {losses(lost, joining)}"
 
     def _report(self) -> tuple[str, Mapping[str, object]]:
         taps = self.taps()
@@ -420,6 +420,15 @@ class _Display:
         """Take the changing line away."""
         if self._live:
             self._live.stop()
+
+
+def losses(lost: Mapping[str, int], joining: int) -> str:
+    """Say how many messages of each topic were lost, and how many of them while a publisher was new."""
+    if not any(lost.values()):
+        return "none lost"
+    of = ", ".join(f"{topic} {count}" for topic, count in lost.items() if count)
+    when = f", {joining} of them in the first second of a publisher" if joining else ""
+    return f"{sum(lost.values())} lost ({of}){when}"
 
 
 def _ignore(message: bytes) -> None:

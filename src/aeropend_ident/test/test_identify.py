@@ -39,11 +39,19 @@ def bag(made):
     return made("good", columns(30.0))
 
 
-def test_the_equations_of_a_rig_are_found_through_its_measurement_chain(bag, tmp_path):
-    result = run(bag, "--method", "weak", "--out", tmp_path / "out")
+@pytest.fixture(scope="module")
+def identified(bag, tmp_path_factory):
+    """What the command says of it, and its folder."""
+    out = tmp_path_factory.mktemp("identified") / "out"
+    result = run(bag, "--method", "weak", "--out", out)
     assert result.returncode == 0, result.stderr
-    assert result.stdout.startswith("d(theta)/dt = 1 theta_dot\nd(theta_dot)/dt = ")
-    body = json.loads((tmp_path / "out" / "identified.json").read_text())
+    return result.stdout, out
+
+
+def test_the_equations_of_a_rig_are_found_through_its_measurement_chain(identified):
+    said, out = identified
+    assert said.startswith("d(theta)/dt = 1 theta_dot\nd(theta_dot)/dt = ")
+    body = json.loads((out / "identified.json").read_text())
     assert list(body)[: len(KEYS)] == KEYS
     assert (len(body["terms"]), body["terms"][:3]) == (31, ["1", "theta", "theta_dot"])
     n = BENCH.numbers()
@@ -57,7 +65,7 @@ def test_the_equations_of_a_rig_are_found_through_its_measurement_chain(bag, tmp
     for channel in ("theta", "i_a", "omega"):
         assert body["free_run"][channel]["gap"] < 2.0 * body["free_run"][channel]["floor"]
     assert set(body["held_out_mse"]) == {"theta", "theta_dot", "i_a", "omega"}
-    assert (tmp_path / "out" / "identified.svg").read_text().startswith("<svg ")
+    assert (out / "identified.svg").read_text().startswith("<svg ")
 
 
 def test_bad_input_gives_one_line_and_no_numbers(bag, made, tmp_path):
@@ -93,14 +101,12 @@ def test_a_bag_with_a_gap_is_refused(bags, tmp_path):
     assert "missing" in refused(gap, "--out", tmp_path / "out")
 
 
-def test_the_model_file_is_asked_for_the_measurement_chain_alone(bag, tmp_path):
+def test_the_model_file_is_asked_for_the_measurement_chain_alone(bag, identified, tmp_path):
     numbers, effects = {n: 1.3 * x for n, x in BENCH.model.items()}, {"coulomb_friction": {"accel": 0.8}}
     other = Model("other", numbers, BENCH.sensing, effects)
     parameters.save(other, tmp_path / "other.yaml", "numbers and an effect that are not the rig's")
-    found = []
-    for model in ("bench", tmp_path / "other.yaml"):
-        result = run(bag, "--method", "weak", "--model", model, "--out", tmp_path / f"out_{len(found)}")
-        assert result.returncode == 0, result.stderr
-        found.append(json.loads((tmp_path / f"out_{len(found)}" / "identified.json").read_text()))
-    assert found[0]["equations"] == found[1]["equations"]
-    assert found[0]["sigma"] == found[1]["sigma"]
+    result = run(bag, "--method", "weak", "--model", tmp_path / "other.yaml", "--out", tmp_path / "out")
+    assert result.returncode == 0, result.stderr
+    by_bench, by_other = (json.loads((o / "identified.json").read_text()) for o in (identified[1], tmp_path / "out"))
+    assert by_bench["equations"] == by_other["equations"]
+    assert by_bench["sigma"] == by_other["sigma"]

@@ -11,7 +11,7 @@ import pytest
 from rosbags.rosbag2 import Reader
 
 from aeropend_ident.bag import Bag
-from aeropend_ident.record import Tap
+from aeropend_ident.record import Tap, losses
 from aeropend_ident.recording import read
 from aeropend_ident.replay import Plan
 
@@ -162,9 +162,15 @@ def test_what_is_lost_of_a_new_publisher_is_told_apart(looks, joining):
     assert tap.lost_joining == joining < tap.lost
 
 
+def test_what_is_lost_is_said_of_each_topic():
+    assert losses({"joint_states": 0, "armature": 0}, 0) == "none lost"
+    assert losses({"joint_states": 2, "armature": 0, "reference": 31}, 0) == "33 lost (joint_states 2, reference 31)"
+    assert losses({"armature": 4}, 3) == "4 lost (armature 4), 3 of them in the first second of a publisher"
+
+
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_record_replay_record_gives_the_same_data(processes, storage):
-    count = 2000
+    count = 1000
     first = record(processes, "first", "while_published:=joint_states", f"storage:={storage}")
     start = feed(processes, count)
     status, said = processes.wait(first)

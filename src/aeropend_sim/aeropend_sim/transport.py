@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How messages travel: by UDP, on one machine too; and how soon who starts is found.
+"""How messages travel: by UDP, on one machine too; how many may wait; and how soon who starts is found.
 
 Fast DDS has shared memory as well. There, whoever starts can stop all that others publish for 333 ms, which costs the
 plant 114 samples (https://github.com/eProsima/Fast-DDS/issues/6535), and whoever is killed can leave a lock on which
 the next to start waits for ever (https://github.com/eProsima/Fast-DDS/issues/1144).
+
+What comes while a process stands still waits in its sockets. The usual 208 KiB are full after some 0.2 s at the sample
+rate, a publisher keeps 100 messages to send again, and the rest is lost. So our sockets ask for 4 MiB.
 
 Who starts announces itself before it listens. Who is there answers at once, and once only: the answer of a fast one is
 missed, and both then wait for its next regular announcement. So these come every second, not every three.
