@@ -201,8 +201,10 @@ class StepTest(Node):
         """Decode, describe and write."""
         kind = LAWS[law]
         # without the reference that ends the test: stamps of a real clock may lie a little off the grid, after it
+        references = self._steps[:-1]
+        end = references[-1][0] + round(1e9 * self._options.hold)
         try:
-            time_, columns, lost = _columns(joints, armatures, self._steps[:-1])
+            time_, columns, lost = _columns(joints, armatures, references, end)
             y = columns[kind.measures]
             if not np.isfinite(y).all():
                 raise UserError(f"{interface.JOINT_STATES} holds no {kind.measures}: nothing to describe")
@@ -219,15 +221,19 @@ class StepTest(Node):
         self.outcome = tell
 
 
-def _columns(joints: Sequence[bytes], armatures: Sequence[bytes], references: Sequence[tuple[int, float]]
+def _columns(joints: Sequence[bytes], armatures: Sequence[bytes], references: Sequence[tuple[int, float]], end: int
              ) -> tuple[steps.Array, dict[str, steps.Array], int]:
-    """Decode and join what came after the first reference: time (M,), columns (M,), and how many were missing."""
+    """Decode and join what came after the first reference, up to `end` (ns).
+
+    Returns:
+        Time (M,), columns (M,), and how many samples were missing.
+    """
     first = references[0][0]
     rows: dict[int, list[float]] = {}
     arm, rotor = interface.JOINTS
     for message in joints:
         stamp, position, velocity = wire.joints(message)
-        if stamp > first:
+        if first < stamp <= end:
             rows[stamp] = [position.get(arm, math.nan), velocity.get(rotor, math.nan), math.nan, math.nan, math.nan]
     for message in armatures:
         stamp, *reading = wire.armature(message)
