@@ -3,6 +3,7 @@
 
 import json
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -45,6 +46,15 @@ def test_the_hidden_effect_is_named(finished):
     # beside other tests a sample in a thousand may be lost on its way, which is said
     assert sum(int(re.fullmatch(r"(\d+) samples? of \w+ ha(?:s|ve) no \w+ of the same stamp", note)[1])
                for note in body["notes"]) <= 12
+
+
+def test_its_verdict_needs_nothing_but_the_recording(finished, tmp_path):
+    shutil.copytree(finished[3] / "recording", tmp_path / "a")
+    subprocess.run([sys.executable, "-m", "aeropend_ident.diagnose", "a", "--out", "verdict"], cwd=tmp_path, check=True,
+                   stdout=subprocess.DEVNULL)
+    here, there = (json.loads((folder / "diagnosis.json").read_text())
+                   for folder in (tmp_path / "verdict", finished[3] / "diagnosis"))
+    assert here["which"] == there["which"]
 
 
 def test_the_plant_runs_the_augmented_model(finished, start):
