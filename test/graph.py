@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -139,9 +140,10 @@ class Graph:
     """The tests' own node."""
 
     def __init__(self) -> None:
-        without_shared_memory()
-        rclpy.init(args=[])
-        self.node = Node("test")
+        with patch.dict(os.environ):  # who is started later chooses for itself
+            without_shared_memory()
+            rclpy.init(args=[])
+            self.node = Node("test")
         self._executor = EventsExecutor()
         self._executor.add_node(self.node)
 

@@ -9,7 +9,7 @@ import pytest
 from blind import __main__ as check
 from blind import plant, score
 
-SEED, COUNT, DURATION, PROCESSES = 4242, 18, 40.0, 2
+SEED, COUNT, DURATION, PROCESSES = 4242, 24, 40.0, 2
 
 pytestmark = pytest.mark.timeout(1200)
 
@@ -35,7 +35,7 @@ def pairs(checked):
 
 def test_every_recording_got_a_verdict(checked):
     _, labels, verdicts = checked
-    assert len(labels) == len(verdicts) == len(check.plan(COUNT, SEED)) > 15
+    assert len(labels) == len(verdicts) == len(check.plan(COUNT, SEED)) > 20
     assert {label["kind"] for label in labels} == set(score.KINDS)
     assert not [v["error"] for v in verdicts.values() if "error" in v]
 
@@ -59,7 +59,7 @@ def test_labels_open_only_after_the_last_verdict(checked):
     out, labels, _ = checked
     content = (out / check.SEALED).read_bytes()
     effects = [e["effect"] for label in labels for e in label["effects"]]
-    assert len(effects) > 10
+    assert len(effects) > 15
     assert not any(effect.encode() in content for effect in effects)
     assert all(effect.encode() in zlib.decompress(content) for effect in effects)
     last = sorted((out / "verdicts").iterdir())[-1]

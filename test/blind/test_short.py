@@ -11,7 +11,7 @@ from blind import cases
 
 
 @pytest.mark.parametrize(("effect", "form", "seed", "verdict"), [
-    ("gust", "table", 201, "gust"), ("gust", "other", 202, "gust"),
+    ("gust", "table", 201, "gust"), ("gust", "other", 202, "gust"), ("gust", "table", 203, "gust"),
     ("own_wake", "table", 201, "unknown"), ("own_wake", "table", 202, "unknown")])
 def test_half_a_minute_is_enough_to_tell_chance_from_what_nobody_knows(effect, form, seed, verdict):
     _, columns = cases.draw("short", "single", [effect], form, BENCH.model, BENCH.sensing, seed, 30.0)

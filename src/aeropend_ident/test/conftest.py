@@ -16,8 +16,6 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from aeropend_sim.transport import PROFILES
-
 STORE = get_typestore(Stores.ROS2_JAZZY)
 JOINT, BATTERY, FLOAT = "sensor_msgs/msg/JointState", "sensor_msgs/msg/BatteryState", "std_msgs/msg/Float64"
 START_NS = 1_700_000_000_000_000_000
@@ -148,7 +146,7 @@ class Processes:
     def __init__(self, folder: Path) -> None:
         Processes._number += 1
         self.environment = {
-            **{name: value for name, value in os.environ.items() if name != PROFILES},  # left by test/graph.py
+            **os.environ,
             "ROS_DOMAIN_ID": str(50 + 25 * WORKER + Processes._number % 25),  # below 50: those of test/graph.py
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
             "PYTHONUNBUFFERED": "1",

@@ -170,7 +170,7 @@ def test_what_is_lost_is_said_of_each_topic():
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_record_replay_record_gives_the_same_data(processes, storage):
-    count = 1000
+    count = 2000
     first = record(processes, "first", "while_published:=joint_states", f"storage:={storage}")
     start = feed(processes, count)
     status, said = processes.wait(first)
