@@ -128,7 +128,7 @@ class Tap:
         self._joined = -math.inf
 
     def take(self) -> tuple[int, bytes] | None:
-        """Take the next message: receive time (ns) and what was on the wire. None when there is none."""
+        """Take the next message: receive time (ns, 0 if unknown) and what was on the wire. None when there is none."""
         handle = self.subscription.handle
         with handle:
             taken = handle.take_message(self.message_class, True)
@@ -144,7 +144,7 @@ class Tap:
                 self._skipped += number - before - 1
                 self._last.remove(before)
             self._last.append(number)
-        return info["received_timestamp"] or time.time_ns(), message
+        return info["received_timestamp"], message
 
     def count_publishers(self, publishers: int, now: float) -> None:
         """Note how many publishers there are now (monotonic, s).
@@ -244,8 +244,9 @@ class Record(Node):
                 if now >= look or ends:
                     self._look(now)
                     look = now + LOOK_S
+                until = time.time_ns() if ends else None  # all topics end there, however long it takes to write them
                 for tap in self._taps.values():
-                    self._drain(tap)
+                    self._drain(tap, until)
                 if now >= checkpoint and not ends:
                     self._writer.checkpoint()
                     stored = sum(self._writer.counts.values())
@@ -270,12 +271,14 @@ class Record(Node):
         shutil.rmtree(self._out, ignore_errors=True)
         return UserError(f"{self._out}: cannot be written: {what}")
 
-    def _drain(self, tap: Tap) -> None:
+    def _drain(self, tap: Tap, until: int | None = None) -> None:
         while (taken := tap.take()) is not None:
             received, message = taken
+            if until is not None and received > until:
+                return
             if tap.connection is None:
                 tap.connection = self._connect(tap)
-            self._writer.write(tap.connection, received, message)
+            self._writer.write(tap.connection, received or time.time_ns(), message)
             tap.count += 1
             tap.heard = time.monotonic()
             if self._first is None and tap.topic != interface.DIAGNOSTICS:  # ours and other nodes' are always there

@@ -60,10 +60,33 @@ rclpy.shutdown()
 """
 
 
-def record(processes, out, *parameters, remap=(), **options):
+SLOW_DISK = """
+'''A recorder whose disk takes 10 ms for a message once it was asked to end.'''
+import sys, time
+from aeropend_ident import record
+
+class Disk(record.BagWriter):
+    slow = False
+
+    def write(self, *message):
+        time.sleep(0.01 * self.slow)
+        super().write(*message)
+
+class Record(record.Record):
+    def close(self):
+        Disk.slow = True
+        super().close()
+
+record.BagWriter, record.Record = Disk, Record
+sys.exit(record.main())
+"""
+
+
+def record(processes, out, *parameters, remap=(), code="", **options):
     """Start recording; return when it does."""
     arguments = ["--ros-args", *(word for one in parameters for word in ("-p", one)), *remap]
-    process = processes.start(str(out), *arguments, module="aeropend_ident.record", **options)
+    module = "" if code else "aeropend_ident.record"
+    process = processes.start(str(out), *arguments, module=module, code=code, **options)
     deadline = time.monotonic() + 60
     while not (processes.folder / out / "metadata.yaml").exists():
         assert process.poll() is None, process.communicate()
@@ -247,6 +270,21 @@ def test_duration_ends_the_recording(processes):
     assert recording.complete
     assert len(recording) > 400
     assert recording.received_ns[-1] - recording.received_ns[0] >= 0.95e9
+
+
+def test_all_topics_end_at_once_however_slow_the_disk(processes):
+    recorder = record(processes, "bag", code=SLOW_DISK)
+    feeder = processes.start("100000", "/", code=FEED)
+    feeder.stdout.readline()
+    time.sleep(1.0)
+    status, said = processes.end(recorder)
+    feeder.kill()
+    assert status == 0, said
+    assert "none lost" in said
+    bag = Bag(processes.folder / "bag")
+    last = [max(received for _, received, _ in bag.messages(lambda name, _, topic=topic: name == topic))
+            for topic in ("/joint_states", "/armature")]
+    assert abs(last[0] - last[1]) < 10e6  # ns; a sample takes 2
 
 
 def test_nothing_heard_is_said(processes):
