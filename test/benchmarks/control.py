@@ -140,7 +140,8 @@ def loop(quick: bool) -> list[Figure]:
                       details, note, about, main=target is not None)
 
     return [
-        figure("samples missed or without a command", f"of {ours['samples']:.0f}", "missed", Target(0.0)),
+        figure("samples missed or without a command", "", "missed", Target(0.0),
+               f"of {ours['samples']:.0f}, the plain node of {peer['samples']:.0f}"),
         figure("p50 from stamp to command received", "ms", "delay_p50_ms", Target(1.0)),
         figure("p99 from stamp to command received", "ms", "delay_p99_ms", Target(3.0)),
         figure("commands that act from the next sample on", "%", "next_percent", None),
