@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every command explains itself, and the shell completes it."""
 
+import os
+import pty
 import re
+import select
 import shlex
 import signal
 import subprocess
@@ -30,6 +33,16 @@ _python_argcomplete "${{words[0]}}"
 printf '%s\\n' "${{COMPREPLY[@]}}"
 """
 """What bash does on TAB: it calls the function that is registered for the command, which sets COMPREPLY."""
+
+ZSH = """
+autoload -U compinit && compinit -u -D
+eval "$({python} -m aeropend_sim.completion)"
+show() {{ print -r -- "<$BUFFER>" }}
+zle -N show
+bindkey '^X' show
+print ready
+"""
+"""Ctrl-X shows the line as it stands."""
 
 
 def shown(entry: EntryPoint, capsys: pytest.CaptureFixture[str]) -> str:
@@ -81,12 +94,51 @@ def completions(line: str) -> list[str]:
 
 @pytest.mark.parametrize(("line", "expected"), [
     ("plant --ros-args -p preset:=", ["bench", "thesis"]),
+    ("plant --ros-args -p effects.coulomb_", ["effects.coulomb_friction.accel:="]),
+    ("demo --effect coulomb", ["coulomb_friction"]),
     ("cascade --ros-args -p model:=CO", ["CONTRIBUTING.md"]),
     ("cascade --ros-args -p model:=t", ["thesis", "test/", "tools/"]),
     ("tune feedback_linearization --mo", ["--model"]),
 ])
 def test_bash_completes_what_a_command_takes(line, expected):
     assert completions(str(Path(sys.executable).parent / line)) == expected
+
+
+@pytest.fixture(scope="module")
+def zsh_completes(tmp_path_factory):
+    """What a zsh on a terminal makes of a line and TAB."""
+    file = tmp_path_factory.mktemp("zsh") / "rc"
+    file.write_text(ZSH.format(python=sys.executable))
+    terminal, end = pty.openpty()
+    said = ""
+
+    def type_in(text: str, until: str) -> str:
+        nonlocal said
+        before = len(said)
+        os.write(terminal, text.encode())
+        while until not in said[before:]:
+            assert select.select([terminal], [], [], 30.0)[0], said
+            said += os.read(terminal, 4096).decode()
+        return said[before:]
+
+    with subprocess.Popen(["zsh", "-f", "-i"], stdin=end, stdout=end, stderr=end, start_new_session=True,
+                          env={**os.environ, "TERM": "dumb"}) as shell:
+        os.close(end)
+        type_in(f"source {file}\n", "\nready")
+        yield lambda line: type_in(f"\x15{line}\t\x18", ">\r\n").rpartition("<")[2].partition(">")[0].rstrip()
+        shell.kill()
+    os.close(terminal)
+
+
+@pytest.mark.parametrize(("line", "completed"), [
+    ("plant --ros-args -p preset:=th", "plant --ros-args -p preset:=thesis"),
+    ("plant --ros-args -p effects.coulomb_friction.a", "plant --ros-args -p effects.coulomb_friction.accel:="),
+    ("cascade --ros-args -p model:=CO", "cascade --ros-args -p model:=CONTRIBUTING.md"),
+    ("tune feedback_linearization --mo", "tune feedback_linearization --model"),
+])
+def test_zsh_completes_it_too(zsh_completes, line, completed):
+    folder = f"{Path(sys.executable).parent}/"
+    assert zsh_completes(folder + line) == folder + completed
 
 
 def test_help_leaves_the_process_as_it_was(capsys):
