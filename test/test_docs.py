@@ -12,8 +12,10 @@ from scipy.signal import lfilter
 from aeropend_control.base import settings
 from aeropend_control.laws import LAWS
 from aeropend_ident import import_table
+from aeropend_ident.discrepancy import in_library
 from aeropend_sim.completion import commands
 from aeropend_sim.effects import CATALOGUE
+from aeropend_sim.parameters import load
 
 ROOT = Path(__file__).parents[1]
 ROWS = {cells[0].strip(" `"): cells for cells in (line.strip("|").split("|") for line in
@@ -137,6 +139,16 @@ def test_python_in_a_document_runs(path):
         if last is not None:
             found = eval(compile(ast.Expression(last.value), str(path), "eval"), names)
             assert {state: set(equation) for state, equation in found.items()} == {"x": {"x", "u"}, "y": {"y", "u"}}
+
+
+def test_the_equations_that_the_readme_shows_are_those_of_the_simulated_rig():
+    true = in_library(load("bench"))
+    for state in ("theta_dot", "i_a", "omega"):
+        (shown,) = re.findall(rf"^    d\({state}\)/dt = (.+)$", README, re.MULTILINE)
+        terms = re.findall(r"(-?) ?\(([\d.e-]+) ± ([\d.e-]+)\) (\S+)", shown)
+        assert {term for *_, term in terms} == true[state].keys()
+        for sign, value, sigma, term in terms:
+            assert abs(float(sign + value) - true[state][term]) < 3.0 * float(sigma), term
 
 
 def test_import_proposes_what_the_readme_shows(tmp_path, monkeypatch, capsys):

@@ -11,6 +11,7 @@ from aeropend_ident.gap.diagnosis import diagnose
 from aeropend_ident.gap.signals import from_arrays
 from aeropend_sim import rig
 from aeropend_sim.effects import CATALOGUE
+from aeropend_sim.excitation import Excitation
 from aeropend_sim.parameters import SAMPLE_PERIOD, Model
 
 RANDOM = {"gust", "speed_spikes"}
@@ -45,6 +46,16 @@ def test_a_rig_whose_numbers_are_merely_a_little_off_has_no_effect(seed):
 def test_two_effects_in_different_places_are_both_found():
     body = diagnose(BENCH, [recorded(71, {"coulomb_friction": {}, "brush_drop": {}})], 2).body
     assert set(body["which"]["effects"]) == {"coulomb_friction", "brush_drop"}
+
+
+def test_friction_and_a_curve_of_thrust_are_found_to_a_part_in_a_thousand():
+    effects = {"coulomb_friction": {"accel": 1.0}, "thrust_exponent": {"n": 2.15}}
+    duty = Excitation(duration=60.0).series()
+    columns, _ = rig.record(drawn_rig(0, effects, off=0.0), duty, 1)
+    body = diagnose(BENCH, [from_arrays(columns | {"duty": duty}, SAMPLE_PERIOD, BENCH.sensing)], 2).body
+    assert set(body["which"]["effects"]) == set(effects)
+    assert candidate(body, "coulomb_friction")["parameters"]["accel"]["value"] == pytest.approx(1.0, abs=2e-3)
+    assert candidate(body, "thrust_exponent")["parameters"]["n"]["value"] == pytest.approx(2.15, abs=2e-3)
 
 
 @pytest.mark.parametrize(("friction", "drop", "first"), [(4.0, 0.05, "coulomb_friction"), (0.2, 0.8, "brush_drop")])
