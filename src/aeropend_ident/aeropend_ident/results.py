@@ -83,8 +83,8 @@ def verdict_lines(body: Mapping[str, object]) -> list[str]:
     if which["verdict"] == "none":
         lines.append("verdict: none. The model explains the recording once its numbers are refitted.")
     elif which["verdict"] == "unknown":
-        lines.append(f"verdict: unknown. Something in the {where['place']} that the catalogue does not explain: "
-                     + "; ".join(which["unexplained"]) + ".")
+        why = f": {'; '.join(which['unexplained'])}" if which["unexplained"] else ""
+        lines.append(f"verdict: unknown. Something in the {where['place']} that the catalogue does not explain{why}.")
     else:
         lines.append(f"verdict: {' and '.join(which['effects'])} ({where['place']})")
     found = {c["effect"]: c for c in reversed(which["candidates"])}

@@ -18,6 +18,7 @@ from aeropend_ident.diagnose import document
 from aeropend_ident.gap import curves, report, words
 from aeropend_ident.gap.diagnosis import diagnose
 from aeropend_ident.gap.signals import from_arrays
+from aeropend_ident.results import verdict_lines
 from aeropend_sim.effects import CATALOGUE, PLACES
 from aeropend_sim.parameters import SAMPLE_PERIOD
 
@@ -213,6 +214,13 @@ def test_unknown(friction):
                                "in this part of the chain: arm.")
     assert "theta is off by 9.1 times the noise" in page.text("header")
     assert page.text("title") == "unknown effect · diagnose"
+
+
+@pytest.mark.parametrize(("reasons", "said"), [
+    ([], "the catalogue does not explain."), (["theta is off", "omega is"], "not explain: theta is off; omega is.")])
+def test_reasons_for_an_unknown_are_said_where_there_are_any(friction, reasons, said):
+    which = {**friction.body["which"], "verdict": "unknown", "effects": [], "unexplained": reasons}
+    assert verdict_lines({**friction.body, "which": which})[0].endswith(said)
 
 
 def test_what_an_unknown_looks_like(strange):

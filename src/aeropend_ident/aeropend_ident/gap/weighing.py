@@ -210,9 +210,11 @@ class Round:
             return {k: r for part in parts for k, r in part(values).items()}
 
         steps, least = (STEPS_UNKNOWN, LEAST) if self.guessed else (STEPS, 0.0)
+        if hypothesis.number and begun is None:  # fitted already: as a mismatch it only surprises less by where it is
+            begun = self.current.values
         if begun is not None:
             return fit(residuals, started(adopted(unknowns, hypothesis), begun), rounds, steps, least)
-        if not hypothesis.number and CATALOGUE[hypothesis.effect].linear_in:
+        if CATALOGUE[hypothesis.effect].linear_in:
             first = fit(lambda values: residuals(from_linear(hypothesis.effect, values)),
                         [*unknowns, *linear_unknowns(hypothesis.effect)], rounds=3, least=least)
             own = from_linear(hypothesis.effect, first.values)
