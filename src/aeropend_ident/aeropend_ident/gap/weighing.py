@@ -126,6 +126,21 @@ class Round:
         work = [self._submit(h, rounds, begun=f.values) if h in likeliest else None for h, f in tried]
         return [(h, w.result() if w else f) for (h, f), w in zip(tried, work, strict=True)]
 
+    def from_elsewhere(self, tried: Tried) -> Tried:
+        """The likeliest begun from their other starts, too: a search may have ended in a valley of its own."""
+        def again(h: Hypothesis) -> list[Future[Fit]]:
+            one = len(h.starts) == 1 or CATALOGUE[h.effect].linear_in
+            return [] if one else [self._submit(h, FIRST_LOOK, start) for start in range(len(h.starts))]
+
+        likeliest = [h for _, h, _ in self._likeliest(tried)[:CONTENDERS]]
+        looks = [[w.result() for w in again(h)] if h in likeliest else [] for h, _ in tried]
+        counts = counts_of([*(f for _, f in tried), *(f for fits in looks for f in fits)])
+        best = [max(fits, key=lambda f: f.likelihood(counts), default=None) for fits in looks]
+        work = [self._submit(h, ROUNDS, begun=b.values) if b else None for (h, _), b in zip(tried, best, strict=True)]
+        ended = [w.result() if w else f for (_, f), w in zip(tried, work, strict=True)]
+        counts = counts_of([*(f for _, f in tried), *ended])
+        return [(h, max(f, g, key=lambda x: x.evidence(counts))) for (h, f), g in zip(tried, ended, strict=True)]
+
     def identified_anew(self, candidates: list[Hypothesis], tried: Tried) -> Tried:
         """Effects of the drive, if nothing tried explains all, identified together with the numbers; and the others.
 

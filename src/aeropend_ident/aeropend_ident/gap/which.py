@@ -132,6 +132,8 @@ def _search_block(chains: Chains, block: str, candidates: list[Hypothesis], wher
             tried, lead = here.led(tried)
             findings.cut_short |= thrifty.runs > MOST_RUNS
         tried = here.to_the_end(tried, FIRST_LOOK if findings.cut_short else ROUNDS, but=lead)
+        if not here.guessed and not any(_passes_as_noise(f, MATERIAL) for _, f in tried):
+            tried = here.from_elsewhere(tried)
         if not findings.found:
             tried = here.identified_anew(open_, tried)
         rivals = here.weighed(tried)
