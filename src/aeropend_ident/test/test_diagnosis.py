@@ -10,6 +10,7 @@ from rigs import BENCH, drawn_rig, recorded, steps
 
 from aeropend_ident.gap.diagnosis import diagnose
 from aeropend_ident.gap.signals import from_arrays
+from aeropend_ident.results import verdict_lines
 from aeropend_sim import rig
 from aeropend_sim.effects import CATALOGUE
 from aeropend_sim.excitation import Excitation
@@ -88,18 +89,31 @@ def test_effects_all_over_the_chain_are_found_and_nothing_else():
     assert set(body["which"]["effects"]) == set(effects)
 
 
-@pytest.mark.parametrize(("number", "factor"), [
-    ("R_a", 1.4), ("mgd_over_J", 1.4), ("J_m", 1.4), ("R_a", 0.8), ("mgd_over_J", 0.845), ("L_over_J", 1.2)])
-def test_a_number_that_is_far_off_is_named(number, factor):
+def far_off(number, factor):
+    """The verdict on a rig of which one number is off by a factor."""
     model = drawn_rig(80, {})
     model = Model("rig", {**model.model, number: factor * BENCH.model[number]}, model.sensing)
     duty = steps(40.0, 80)
     columns, _ = rig.record(model, duty, 80)
     body = diagnose(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)], 2).body
     assert body["which"]["verdict"] == "parameter_mismatch"
-    found = candidate(body, "parameter_mismatch")["parameters"]
+    return body
+
+
+@pytest.mark.parametrize(("number", "factor"), [
+    ("R_a", 1.4), ("mgd_over_J", 1.4), ("J_m", 1.4), ("R_a", 0.8), ("mgd_over_J", 0.845)])
+def test_a_number_that_is_far_off_is_named(number, factor):
+    found = candidate(far_off(number, factor), "parameter_mismatch")["parameters"]
     assert list(found) == [number]
     assert found[number]["value"] == pytest.approx(factor * BENCH.model[number], rel=0.06)
+
+
+def test_two_numbers_of_which_the_product_counts_are_not_separable():
+    body = far_off("L_over_J", 1.2)
+    (pair,) = body["which"]["not_separable"]
+    assert set(pair) == {"parameter_mismatch:L_over_J", "parameter_mismatch:k_thrust"}
+    assert all(name in body["which"]["next_experiment"]["why"] for name in pair)
+    assert any(line.startswith("  not separable") and pair[1] in line for line in verdict_lines(body))
 
 
 def test_what_the_catalogue_does_not_hold_is_unknown():

@@ -134,7 +134,7 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
                                           "dependence": check.dependence}
                                 for check in settled.checks.values() for channel in check.rms},
                   "unexplained": reasons, "unknown": strange.document() if strange is not None else None,
-                  "not_separable": [[a.hypothesis.effect, b.hypothesis.effect] for a, b in undecided],
+                  "not_separable": [list(told.names(a, b)) for a, b in undecided],
                   "next_experiment": told.next_experiment(model, recordings[0], undecided, values, tried)},
         "shrink": {"gap": gap_before.total, "gap_after": gap_after.total, "floor": scorer.bottom(gap_before, floors),
                    "closed": share, "low": low, "high": high},

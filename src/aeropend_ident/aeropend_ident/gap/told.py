@@ -120,7 +120,13 @@ def not_separable(findings: Mapping[str, Findings], least: float = UNDECIDED) ->
     """Pairs that this recording cannot tell apart: the first of a round and rivals of `least` probability."""
     return [(round_[0], w) for f in findings.values() for round_ in [*f.found, f.rivals]
             if round_ and round_[0].probability > UNDECIDED for w in round_[1:]
-            if w.probability > least and w.hypothesis.effect != round_[0].hypothesis.effect]
+            if w.probability > least]
+
+
+def names(first: Weighed, second: Weighed) -> tuple[str, str]:
+    """What two rivals are called: their effects, or, of two numbers that may be off, `parameter_mismatch:NUMBER`."""
+    a, b = first.hypothesis, second.hypothesis
+    return (a.effect, b.effect) if a.effect != b.effect else (a.name, b.name)
 
 
 def next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[Weighed, Weighed]],
@@ -136,8 +142,7 @@ def next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[Weighe
     one, other = ({**values, **own, **w.fit.values} for w in (first, second))
     if any("@" in n for n in values):
         one, other = identified.shared(one), identified.shared(other)
-    names = first.hypothesis.effect, second.hypothesis.effect
-    return experiment.next_experiment(model, signals, one, other, names, tried)
+    return experiment.next_experiment(model, signals, one, other, names(first, second), tried)
 
 
 def _interval(value: float, sd: float, low: float = -math.inf, high: float = math.inf) -> dict[str, float]:
