@@ -30,8 +30,7 @@ demo: .venv/.runtime ## run a plant with a hidden effect and name it (EFFECT=cou
 # First what only computes, then what runs nodes, two files at a time, then what needs the machine to itself. Nodes share two
 # cores badly, so a test of theirs that fails is tried again, and the summary says so. Exit code 5: ARGS chose none of these.
 test: .venv/.dev ## build and test with colcon in a temporary folder, then run every test (ARGS="-k plant")
-	tools/setup firmware
-	tools/setup zsh
+	tools/setup test
 	$(MAKE) -C firmware
 	tools/colcon-check
 	$(BIN)/python -m pytest -n auto --dist loadscope -m "not live" $(ARGS) || [ $$? = 5 -a -n "$(ARGS)" ]

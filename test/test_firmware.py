@@ -4,12 +4,15 @@
 import binascii
 import ctypes
 import math
+import re
 import subprocess
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
 from boards import FIRMWARE, altered, build, frame
+from boot_loader import BootLoader
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -245,6 +248,30 @@ class TestPid:
         assert not firmware.gains_valid(ctypes.byref(self.make(**{"kp": 1.0, **wrong}).gains))
 
 
+class TestWiring:
+    """What a person wires by README.md is what the program uses."""
+
+    MEGA: ClassVar = {
+        "D9": "PH6", "D11": "PB5", "D12": "PB6", "D22": "PA0", "D23": "PA1", "D24": "PA2", "D49": "PL0",
+        "A0": "ADC0", "A1": "ADC1", "A2": "ADC2", "A3": "ADC3"}
+    """Pins of an Arduino Mega 2560 and of its chip, as Arduino's pinout of the board (A000067) has them."""
+
+    def wired(self) -> dict[str, str]:
+        """Return the chip's pin by the board's, of README.md."""
+        rows = re.findall(r"^\| ([DA]\d+) \| (P[A-L]\d|ADC\d+)\b", (FIRMWARE / "README.md").read_text(), re.MULTILINE)
+        return dict(rows)
+
+    def test_the_board_s_pins_are_the_chip_s_pins_beside_them(self) -> None:
+        assert self.wired() == self.MEGA
+
+    def test_the_program_uses_the_pins_that_are_wired(self) -> None:
+        pins = (FIRMWARE / "pins.h").read_text()
+        digital = {board: chip for chip, board in re.findall(r"^#define \w+ (P\w\d)\s+// (D\d+)", pins, re.MULTILINE)}
+        analog = {pin: f"ADC{pin[1:]}" for line in re.findall(r"^#define ADC_.*// (.*)", pins, re.MULTILINE)
+                  for pin in re.findall(r"\bA\d\b", line)}
+        assert {"D49": "PL0", **digital, **analog} == self.wired()  # Timer4 has its capture pin, PL0, from the chip
+
+
 class TestBuild:
     def test_prints_what_the_program_takes(self) -> None:
         build()
@@ -257,6 +284,27 @@ class TestBuild:
         done = subprocess.run(["make", "-C", str(FIRMWARE), "flash"], capture_output=True, text=True, check=False)
         assert done.returncode == 2
         assert "flash: name the board's port" in done.stderr
+
+    @pytest.mark.parametrize("worn", [None, 0x123])
+    def test_flash_writes_the_program_and_reads_it_back(self, tmp_path: Path, worn: int | None) -> None:
+        build()
+        loader = BootLoader(worn)
+        try:
+            done = subprocess.run(["make", "-C", str(FIRMWARE), "flash", f"PORT={loader.port}"], capture_output=True,
+                                  text=True, check=False)
+        finally:
+            loader.stop()
+        if worn is not None:
+            assert done.returncode == 2
+            assert "verification" in done.stderr
+            return
+        assert done.returncode == 0, done.stderr
+        image = tmp_path / "program.bin"
+        sections = ["-j", ".text", "-j", ".data"]
+        subprocess.run(["avr-objcopy", *sections, "-O", "binary", FIRMWARE / "build/aeropend.elf", image], check=True)
+        program = image.read_bytes()
+        assert loader.flash == program.ljust(len(loader.flash), b"\xff")
+        assert loader.left
 
     def test_the_same_sources_make_the_same_program(self, tmp_path: Path) -> None:
         programs = []

@@ -35,7 +35,8 @@ def setup(tmp_path):
 @pytest.mark.parametrize(("what", "why", "package"), [
     ("compiler", "there is no working C compiler", "gcc"),
     ("firmware", "the board's program and its emulator are built from source", "gcc-avr"),
-    ("zsh", "completion is tested in zsh", "zsh")])
+    ("test", "flash the board's program", "avrdude"),
+    ("test", "press TAB in zsh", "zsh")])
 def test_what_is_missing_is_installed_and_said(setup, what, why, package):
     said, code, asked = setup(what, "sudo", "apt-get")
     assert code == 0, said

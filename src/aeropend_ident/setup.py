@@ -17,7 +17,7 @@ setup(
     install_requires=["Jinja2", "joblib", "lz4", "numba", "numpy", "openpyxl", "PyYAML", "rich", "rosbags", "scipy",
                       "threadpoolctl"],
     extras_require={"dask": ["dask", "distributed"], "matlab": ["h5py"],
-                    "test": ["h5py", "mcap", "pytest", "pytest-timeout"]},
+                    "test": ["h5py", "mcap-ros2-support", "pytest", "pytest-timeout"]},
     python_requires=">=3.10",
     zip_safe=False,
     maintainer="aeropend maintainers",

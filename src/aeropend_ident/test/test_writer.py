@@ -3,10 +3,13 @@
 
 import io
 import sqlite3
+from dataclasses import fields
 
+import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
 
@@ -89,6 +92,35 @@ def test_ends_as_rosbags_would_end_it(bags, tmp_path, storage):
         file.name for file in (tmp_path / "b" / "bag").iterdir()
     )
     assert found(tmp_path / "a" / "bag") == found(tmp_path / "b" / "bag")
+
+
+def test_foxglove_s_own_reader_decodes_every_message_by_the_schemas_in_the_file(bags, tmp_path):
+    made = bags.content(10)
+    writer = BagWriter(tmp_path / "bag")
+    writer.open()
+    put(writer, bags, made)
+    writer.close()
+    with (tmp_path / "bag" / "bag.mcap").open("rb") as stream:
+        read = [(channel.topic, message) for _, channel, _, message in
+                make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages()]
+    assert len(read) == len(made.messages)
+    for (topic, message), (put_on, msgtype, _, data) in zip(read, made.messages, strict=True):
+        assert topic == put_on
+        assert_same(message, bags.store.deserialize_cdr(data, msgtype))
+
+
+def assert_same(read, wanted):
+    """Field by field, through all messages within messages."""
+    if hasattr(wanted, "__msgtype__"):
+        for field in fields(wanted):
+            if field.name != "__msgtype__" and not field.name.isupper():  # in capitals: constants
+                assert_same(getattr(read, field.name), getattr(wanted, field.name))
+    elif isinstance(wanted, (list, np.ndarray)):
+        assert len(read) == len(wanted)
+        for one, other in zip(read, wanted, strict=True):
+            assert_same(one, other)
+    else:
+        assert read == wanted or (read != read and wanted != wanted)
 
 
 def test_metadata_has_the_fields_of_version_9(bags, tmp_path):

@@ -2,6 +2,8 @@
 """The drawing of the rig moves as the rig does."""
 
 import math
+import re
+import subprocess
 import xml.etree.ElementTree as ET
 from importlib.resources import files
 
@@ -13,7 +15,8 @@ from aeropend_sim import interface
 from aeropend_sim.parameters import load
 from aeropend_sim.pose import PAUSE_S, Rotor
 
-ROBOT = ET.fromstring(files("aeropend_sim").joinpath("urdf/aeropendulum.urdf").read_text(encoding="utf-8"))
+URDF = files("aeropend_sim").joinpath("urdf/aeropendulum.urdf")
+ROBOT = ET.fromstring(URDF.read_text(encoding="utf-8"))
 JOINTS = {joint.get("name"): joint for joint in ROBOT.iter("joint")}
 G = 9.81
 
@@ -44,6 +47,14 @@ def test_joints_are_named_as_in_joint_states():
     assert {joint.find(end).get("link") for joint in JOINTS.values() for end in ("parent", "child")} == links
     named = {material.get("name") for material in ROBOT.findall("material")}
     assert {material.get("name") for material in ROBOT.iter("material")} == named
+
+
+def test_the_parser_of_rviz_and_robot_state_publisher_takes_the_drawing():
+    """check_urdf is urdfdom, which both read a drawing with."""
+    done = subprocess.run(["check_urdf", str(URDF)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.findall(r"child\(\d\): +(\w+)", done.stdout) == ["rod", "propeller"]
+    assert not re.search("warning|error", done.stdout + done.stderr, re.IGNORECASE)
 
 
 def test_the_arm_hangs_at_0_and_is_level_in_front_at_a_quarter_turn():
