@@ -84,6 +84,15 @@ def terminal_voltage(duty: float, t: float, y: Array, p: Array) -> float:
 
 
 @njit(cache=True)
+def voltages(duty: float, first: int, y: Array, p: Array) -> Array:
+    """Armature voltage (N,) at the states (N, 16) of the samples from `first` on."""
+    v = np.empty(len(y))
+    for k in range(len(y)):
+        v[k] = terminal_voltage(duty, (first + k) * PERIOD, y[k], p)
+    return v
+
+
+@njit(cache=True)
 def derivative(y: Array, t: float, duty: float, p: Array, gusts: Array) -> Array:
     """Time derivative of the states."""
     other = p[I.other_form]
@@ -273,8 +282,7 @@ def states(p: Array, duty: Array, gusts: Array, controller: Callable[[float, flo
             continue
         path = odeint(derivative, y, np.maximum(grid, a), (u, p, gusts), tcrit=[b], **options)
         out[done:last] = path[1:-1]
-        for k in range(done, last):
-            v[k] = terminal_voltage(u, k * PERIOD, out[k], p)
+        v[done:last] = voltages(u, done, out[done:last], p)
         y, done = path[-1], last
     return out, v, applied
 
