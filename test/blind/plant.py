@@ -92,11 +92,16 @@ def voltages(duty: float, first: int, y: Array, p: Array) -> Array:
     return v
 
 
+def derivative(y: Array, t: float, duty: float, p: Array, gusts: Array, d: Array) -> Array:
+    """Time derivative of the states, written to d (16,): to make an array each time takes longer than to fill it."""
+    _derivative(y, t, duty, p, gusts, d)
+    return d
+
+
 @njit(cache=True)
-def derivative(y: Array, t: float, duty: float, p: Array, gusts: Array) -> Array:
-    """Time derivative of the states."""
+def _derivative(y: Array, t: float, duty: float, p: Array, gusts: Array, d: Array) -> None:
     other = p[I.other_form]
-    d = np.zeros(16)
+    d[:] = 0.0
     i, w, theta, rate = y[S.i], y[S.omega], y[S.theta], y[S.rate]
     v = terminal_voltage(duty, t, y, p)
     if other and p[I.supply_sag_r_supply] > 0.0:
@@ -207,7 +212,6 @@ def derivative(y: Array, t: float, duty: float, p: Array, gusts: Array) -> Array
         first, second = p[I.filter_tau] + 1.4 * lag, p[I.filter_tau] + 0.6 * lag
     d[S.stage1] = (shown - y[S.stage1]) / first
     d[S.stage2] = (y[S.stage1] - y[S.stage2]) / second
-    return d
 
 
 def packed(numbers: Mapping[str, float], filter_tau: float, effects: Mapping[str, Mapping[str, float]],
@@ -252,7 +256,7 @@ def states(p: Array, duty: Array, gusts: Array, controller: Callable[[float, flo
     """
     n = len(duty)
     delay = p[I.command_delay_delay]
-    y = np.zeros(16)
+    y, room = np.zeros(16), np.zeros(16)
     y[S.stage1] = y[S.stage2] = p[I.angle_offset_bias] + p[I.encoder_eccentricity_amplitude] * math.sin(
         p[I.encoder_eccentricity_phase]) + p[I.outside_encoder_harmonic] * math.sin(1.0)
     options: dict[str, Any] = {"rtol": 1e-7, "atol": 1e-8, "mxstep": 20000}
@@ -265,7 +269,7 @@ def states(p: Array, duty: Array, gusts: Array, controller: Callable[[float, flo
             acting = applied[k - late] if k >= late else 0.0
             v[k] = terminal_voltage(acting, k * PERIOD, y, p)
             span = np.array([k * PERIOD, (k + 1) * PERIOD])
-            y = odeint(derivative, y, span, (acting, p, gusts), tcrit=span[1:], **options)[-1]
+            y = odeint(derivative, y, span, (acting, p, gusts, room), tcrit=span[1:], **options)[-1]
         return out, v, applied
     edges = np.flatnonzero(np.diff(duty, prepend=duty[0] - 1.0))
     starts = edges * PERIOD + np.where(edges > 0, delay, 0.0)
@@ -280,7 +284,7 @@ def states(p: Array, duty: Array, gusts: Array, controller: Callable[[float, flo
         grid = np.concatenate([[a], np.arange(done, last) * PERIOD, [b]])
         if b <= a:
             continue
-        path = odeint(derivative, y, np.maximum(grid, a), (u, p, gusts), tcrit=[b], **options)
+        path = odeint(derivative, y, np.maximum(grid, a), (u, p, gusts, room), tcrit=[b], **options)
         out[done:last] = path[1:-1]
         v[done:last] = voltages(u, done, out[done:last], p)
         y, done = path[-1], last

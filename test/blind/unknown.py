@@ -169,7 +169,7 @@ def decay(name: str, damping: str, nominal: Mapping[str, float], seed: int, rate
     y[[S.theta, S.stage1, S.stage2]] = first
     t = np.arange(0.0, held + 1.02 * lasts, 1.0 / rate)
     since, back = np.unique(np.maximum(t - held, 0.0), return_inverse=True)
-    path = odeint(plant.derivative, y, since, (0.0, p, np.zeros(0)), rtol=1e-8, atol=1e-9, mxstep=50000)
+    path = odeint(plant.derivative, y, since, (0.0, p, np.zeros(0), np.zeros(16)), rtol=1e-8, atol=1e-9, mxstep=50000)
     theta = path[back, S.theta] + rng.uniform(0.0, 0.3) * lsb * rng.standard_normal(len(t))
     nothing = np.full(len(t), np.nan)
     entry = [{"effect": e, "place": "arm", "parameters": q} for e, q in effects.items()]
