@@ -38,7 +38,7 @@ FAR = 1e3
 """Spreads of a state from its middle at which a run counts as run away."""
 
 
-@njit(cache=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
 def _rates(x: Array, n: int, which: Indices, table: Table, equation: Indices, term: Indices, c: Array, value: Array,
            slope: Array, rate: Array, jacobian: Array) -> None:
     """Right-hand side and, where slope has rows, its Jacobian at variables x."""
@@ -59,10 +59,10 @@ def _rates(x: Array, n: int, which: Indices, table: Table, equation: Indices, te
 @njit(cache=True, error_model="numpy", nogil=True)
 def _advance(y: Array, phi: Array, s: float, steps: int, which: Indices, table: Table, equation: Indices,
              term: Indices, c: Array, value: Array, slope: Array, x: Array, rate: Array, j: Array, total: Array,
-             turn: Array, now: Array) -> None:
+             turn: Array, now: Array, moved: Array) -> None:
     """Advance the state y (n,), and its derivatives phi (n, n) where they have rows, by steps of s (Runge-Kutta, 4).
 
-    x holds the inputs behind the states; value to now are room to work in.
+    x holds the inputs behind the states; value to moved are room to work in.
     """
     n, m = len(y), phi.shape[0]
     for _ in range(steps):
@@ -80,14 +80,18 @@ def _advance(y: Array, phi: Array, s: float, steps: int, which: Indices, table: 
             for i in range(n):
                 total[i] += weight * rate[i]
                 x[i] = y[i] + ahead * rate[i]
-            for k in range(m):
-                for i in range(m):
-                    rate[i] = 0.0
-                    for q in range(m):
-                        rate[i] += j[i, q] * now[q, k]
-                for i in range(m):
-                    turn[i, k] += weight * rate[i]
-                    now[i, k] = phi[i, k] + ahead * rate[i]
+            for i in range(m):
+                for k in range(m):
+                    moved[i, k] = 0.0
+                for q in range(m):
+                    a = j[i, q]
+                    if a != 0.0:  # few states act on a state
+                        for k in range(m):
+                            moved[i, k] += a * now[q, k]
+            for i in range(m):
+                for k in range(m):
+                    turn[i, k] += weight * moved[i, k]
+                    now[i, k] = phi[i, k] + ahead * moved[i, k]
         for i in range(n):
             y[i] += total[i]
         for i in range(m):
@@ -109,7 +113,7 @@ def _run(x0: Array, u: Array, h: float, steps: int, which: Indices, table: Table
         for i in range(u.shape[1]):
             x[n + i] = u[k, i]
         _advance(y, none, h / steps, steps, which, table, equation, term, c, value, none, x, rate, none, total, none,
-                 none)
+                 none, none)
         for i in range(n):
             if not low[i] < y[i] < high[i]:
                 return False
@@ -133,7 +137,8 @@ def _sensitivities(states: Array, u: Array, h: float, steps: int, which: Indices
     terms, variables = len(table.first) - 1, states.shape[1] + u.shape[1]
     value, slope, x, none = np.empty(terms), np.empty((terms, variables)), np.empty(variables), np.empty((0, 0))
     f0, fm, f1 = np.zeros(terms), np.zeros(terms), np.zeros(terms)
-    rate, total, j, turn, now = np.empty(n), np.empty(n), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    rate, total, j, moved = np.empty(n), np.empty(n), np.empty((n, n)), np.empty((n, n))
+    turn, now = np.empty((n, n)), np.empty((n, n))
     first, second, whole, y = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty(n)
     new = np.empty_like(carry)
     half = steps // 2
@@ -148,12 +153,13 @@ def _sensitivities(states: Array, u: Array, h: float, steps: int, which: Indices
         for i in range(u.shape[1]):
             x[n + i] = u[k, i]
         terms_at(x, wanted, table, f0, none)
-        _advance(y, first, h / steps, half, which, table, equation, term, c, value, slope, x, rate, j, total, turn, now)
+        _advance(y, first, h / steps, half, which, table, equation, term, c, value, slope, x, rate, j, total, turn, now,
+                 moved)
         for i in range(n):
             x[i] = y[i]
         terms_at(x, wanted, table, fm, none)
         _advance(y, second, h / steps, half, which, table, equation, term, c, value, slope, x, rate, j, total, turn,
-                 now)
+                 now, moved)
         for i in range(n):
             x[i] = y[i]
         terms_at(x, wanted, table, f1, none)

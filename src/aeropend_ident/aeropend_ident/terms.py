@@ -148,45 +148,63 @@ def _apply(factor: Factor, x: Array) -> Array:
     return np.asarray(np.sign(x) * np.abs(x) ** factor.power)
 
 
-@njit(cache=True, error_model="numpy")
-def factor_at(kind: int, power: float, x: float) -> tuple[float, float]:
-    """A factor and its slope."""
+# inlined: to count the references of so many arrays at each call takes longer than the terms
+@njit(inline="always", error_model="numpy")
+def factor_at(kind: int, power: float, x: float) -> float:
+    """A factor."""
     if kind == SIN:
-        return np.sin(x), np.cos(x)
+        return np.sin(x)
     if kind == COS:
-        return np.cos(x), -np.sin(x)
+        return np.cos(x)
     if kind == ABS:
-        return abs(x), np.sign(x)
+        return abs(x)
     if kind == SIGN:
-        return np.sign(x), 0.0
+        return np.sign(x)
     if power == 1.0:
-        return x, 1.0
+        return x
     if power == 2.0:
-        return x * x, 2.0 * x
+        return x * x
     if power == np.floor(power):
-        return x**power, power * x ** (power - 1.0)
-    size = abs(x)
-    return np.sign(x) * size**power, power * size ** (power - 1.0) if size > 0.0 else 0.0
+        return x**power
+    return np.sign(x) * abs(x) ** power
 
 
-@njit(cache=True, error_model="numpy")
+@njit(inline="always", error_model="numpy")
+def slope_at(kind: int, power: float, x: float) -> float:
+    """The slope of a factor."""
+    if kind == SIN:
+        return np.cos(x)
+    if kind == COS:
+        return -np.sin(x)
+    if kind == ABS:
+        return np.sign(x)
+    if kind == SIGN:
+        return 0.0
+    if power == 1.0:
+        return 1.0
+    if power == 2.0:
+        return 2.0 * x
+    if power == np.floor(power):
+        return power * x ** (power - 1.0)
+    return power * abs(x) ** (power - 1.0) if x != 0.0 else 0.0
+
+
+@njit(inline="always", error_model="numpy")
 def terms_at(x: Array, which: Indices, table: Table, value: Array, slope: Array) -> None:
     """Fill value[j] and slope[j, :] of the terms `which` at variables x (V,); slope may have no rows: left out."""
     with_slope = slope.shape[0] > 0
     for j in which:
         product = 1.0
         a, b = table.first[j], table.first[j + 1]
+        for f in range(a, b):
+            product *= factor_at(table.kind[f], table.power[f], x[table.variable[f]])
+        value[j] = product
         if with_slope:
             for k in range(slope.shape[1]):
                 slope[j, k] = 0.0
-        for f in range(a, b):
-            v, d = factor_at(table.kind[f], table.power[f], x[table.variable[f]])
-            product *= v
-            if with_slope:
-                rest = d
+            for f in range(a, b):
+                rest = slope_at(table.kind[f], table.power[f], x[table.variable[f]])
                 for k in range(a, b):
                     if k != f:
-                        w, _ = factor_at(table.kind[k], table.power[k], x[table.variable[k]])
-                        rest *= w
+                        rest *= factor_at(table.kind[k], table.power[k], x[table.variable[k]])
                 slope[j, table.variable[f]] += rest
-        value[j] = product
