@@ -26,7 +26,7 @@ def duty(numbers: Numbers, voltage: ArrayLike) -> Array:
     """Duty that gives a voltage (V), clipped to 0..1; at 0 V and below the duty is 0 (the map's dead zone)."""
     v = np.asarray(voltage, dtype=float)
     root = np.maximum(0.0, (v - numbers["k0"]) / numbers["k1"])
-    return np.where(v <= 0.0, 0.0, np.clip((root**2 - numbers["k3"]) / numbers["k2"], 0.0, 1.0))
+    return np.where(v <= 0.0, 0.0, np.minimum(np.maximum((root * root - numbers["k3"]) / numbers["k2"], 0.0), 1.0))
 
 
 def thrust(numbers: Numbers, speed: ArrayLike) -> Array:
@@ -61,6 +61,17 @@ def speed_at(numbers: Numbers, voltage: ArrayLike) -> Array:
     return 2.0 * v / (b + np.sqrt(b * b + 4.0 * a * np.maximum(v, 0.0)))
 
 
+def voltages(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, float]],
+             period: float, start: int = 0, before: float = 0.0) -> tuple[Array, Array]:
+    """`acting_voltage` and `sampled_voltage`, worked out together."""
+    first, then, part = _over_hold(numbers, duty, effects, period, start, before)
+    if part == 0.0:
+        return then, first
+    lengths = period * numbers["R_a"] / numbers["L_a"]  # of the hold, in time constants of the winding
+    share = math.expm1(part * lengths) / math.expm1(lengths) if lengths < 500.0 else 0.0
+    return share * first + (1.0 - share) * then, first
+
+
 def acting_voltage(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, float]],
                    period: float, start: int = 0, before: float = 0.0) -> Array:
     """Voltage at the bridge over each hold of a duty series, with the effects that need no state.
@@ -79,34 +90,29 @@ def acting_voltage(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[
     Returns:
         (N,) V.
     """
-    first, then, part = _over_hold(numbers, duty, effects, period, start, before)
-    if part == 0.0:
-        return then
-    lengths = period * numbers["R_a"] / numbers["L_a"]  # of the hold, in time constants of the winding
-    share = math.expm1(part * lengths) / math.expm1(lengths) if lengths < 500.0 else 0.0
-    return share * first + (1.0 - share) * then
+    return voltages(numbers, duty, effects, period, start, before)[0]
 
 
 def sampled_voltage(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, float]],
                     period: float, start: int = 0, before: float = 0.0) -> Array:
     """As `acting_voltage`, at the instant of each sample, when each hold begins."""
-    return _over_hold(numbers, duty, effects, period, start, before)[0]
+    return voltages(numbers, duty, effects, period, start, before)[1]
 
 
 def _over_hold(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, float]], period: float, start: int,
                before: float) -> tuple[Array, Array, float]:
     """Voltage (N,) at the beginning of each hold, voltage after a delayed change in it, and when in it that comes."""
     n = len(duty)
-    time = (start + np.arange(n)) * period
 
     def at_bridge(v: Array) -> Array:
         if "supply_drift" in effects:
+            time = (start + np.arange(n)) * period
             v = v * np.maximum(0.0, 1.0 - effects["supply_drift"]["rate"] * time)
         if "bridge_drop" in effects:
             v = np.maximum(0.0, v - effects["bridge_drop"]["v_drop"])
         return v
 
-    delay = effects.get("command_delay", {}).get("delay", 0.0) / period
+    delay = effects["command_delay"]["delay"] / period if "command_delay" in effects else 0.0
     whole = math.floor(delay + 1e-9)
     part = max(delay - whole, 0.0) if delay - whole > 1e-9 else 0.0
     if whole == 0 and part == 0.0:

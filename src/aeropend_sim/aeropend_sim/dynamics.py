@@ -620,12 +620,12 @@ def simulate(model: Model, duty: Array, period: float = SAMPLE_PERIOD, state: St
         Trajectory of (N,) arrays at the N sample instants.
     """
     duty = np.ascontiguousarray(duty, dtype=float)
-    v = actuator.acting_voltage(model.numbers(), duty, model.effects, period, start)
+    v, sampled = actuator.voltages(model.numbers(), duty, model.effects, period, start)
     out = np.empty((7, len(duty)))
     c, e, x = prepare(model, period)
     run(v, np.zeros(len(duty)) if noise is None else noise, State() if state is None else state, c, e, x, out)
     if "command_delay" in model.effects:
-        out[4] += actuator.sampled_voltage(model.numbers(), duty, model.effects, period, start) - v
+        out[4] += sampled - v
     return Trajectory(*out)
 
 

@@ -39,6 +39,7 @@ class Rig:
 
     def __init__(self, model: Model, seed: int = 0, period: float = SAMPLE_PERIOD) -> None:
         self.model, self.seed, self.period = model, seed, period
+        self._numbers = model.numbers()
         self._plant = dynamics.prepare(model, period)
         self._chain = sensing.prepare(model, period)
         delay = model.effects.get("command_delay", {}).get("delay", 0.0)
@@ -68,9 +69,9 @@ class Rig:
         duty = np.ascontiguousarray(duty, dtype=float)
         n = len(duty)
         known = np.concatenate([self._past, duty])
-        supplied = (self.model.numbers(), known, self.model.effects, self.period, self._count - len(self._past))
-        v = actuator.acting_voltage(*supplied)[len(self._past):]
-        sampled = actuator.sampled_voltage(*supplied)[len(self._past):]
+        start = self._count - len(self._past)
+        v, sampled = (x[len(self._past):] for x in actuator.voltages(
+            self._numbers, known, self.model.effects, self.period, start))
         self._past = known[-self._history:]
         truth, read = np.empty((7, n)), np.empty((4, n))
         self._state = dynamics.run(v, self._kicks.standard_normal(n), self._state, *self._plant, truth)
