@@ -38,7 +38,7 @@ FAR = 1e3
 """Spreads of a state from its middle at which a run counts as run away."""
 
 
-@njit(inline="always", error_model="numpy")
+@njit(inline="always", error_model="numpy")  # for the reason that the terms are
 def _rates(x: Array, n: int, which: Indices, table: Table, equation: Indices, term: Indices, c: Array, value: Array,
            slope: Array, rate: Array, jacobian: Array) -> None:
     """Right-hand side and, where slope has rows, its Jacobian at variables x."""

@@ -186,7 +186,7 @@ def slope_at(kind: int, power: float, x: float) -> float:
         return 2.0 * x
     if power == np.floor(power):
         return power * x ** (power - 1.0)
-    return power * abs(x) ** (power - 1.0) if x != 0.0 else 0.0
+    return power * abs(x) ** (power - 1.0) if abs(x) > 0.0 else 0.0
 
 
 @njit(inline="always", error_model="numpy")

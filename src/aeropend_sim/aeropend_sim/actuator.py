@@ -96,7 +96,7 @@ def acting_voltage(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[
 def sampled_voltage(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, float]],
                     period: float, start: int = 0, before: float = 0.0) -> Array:
     """As `acting_voltage`, at the instant of each sample, when each hold begins."""
-    return voltages(numbers, duty, effects, period, start, before)[1]
+    return _over_hold(numbers, duty, effects, period, start, before)[0]
 
 
 def _over_hold(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, float]], period: float, start: int,

@@ -115,10 +115,7 @@ class Round:
             return tried, None
         best = self._submit(lead, ROUNDS, begun=begun.values).result()
         led = [None if h is lead else self._submit(h, FIRST_LOOK_UNKNOWN, begun=best.values) for h, _ in tried]
-        anew = [best if one is None else one.result() for one in led]
-        counts = counts_of([*anew, *(f for _, f in tried)])
-        better = [(h, max(f, g, key=lambda x: x.evidence(counts))) for (h, f), g in zip(tried, anew, strict=True)]
-        return better, lead
+        return better(tried, [best if one is None else one.result() for one in led]), lead
 
     def to_the_end(self, tried: Tried, rounds: int = ROUNDS, *, but: Hypothesis | None = None) -> Tried:
         """The likeliest fitted to their end, the others as they are."""
@@ -137,9 +134,7 @@ class Round:
         counts = counts_of([*(f for _, f in tried), *(f for fits in looks for f in fits)])
         best = [max(fits, key=lambda f: f.likelihood(counts), default=None) for fits in looks]
         work = [self._submit(h, ROUNDS, begun=b.values) if b else None for (h, _), b in zip(tried, best, strict=True)]
-        ended = [w.result() if w else f for (_, f), w in zip(tried, work, strict=True)]
-        counts = counts_of([*(f for _, f in tried), *ended])
-        return [(h, max(f, g, key=lambda x: x.evidence(counts))) for (h, f), g in zip(tried, ended, strict=True)]
+        return better(tried, [w.result() if w else f for (_, f), w in zip(tried, work, strict=True)])
 
     def identified_anew(self, candidates: list[Hypothesis], tried: Tried) -> Tried:
         """Effects of the drive, if nothing tried explains all, identified together with the numbers; and the others.
@@ -270,6 +265,12 @@ def counts_of(fits: Iterable[Fit]) -> dict[str, float]:
         for channel, n in f.independent.items():
             counts[channel] = max(counts.get(channel, 0.0), n)
     return counts
+
+
+def better(tried: Tried, again: list[Fit]) -> Tried:
+    """Each hypothesis with the better by evidence of its two fits."""
+    counts = counts_of([*again, *(f for _, f in tried)])
+    return [(h, max(f, g, key=lambda x: x.evidence(counts))) for (h, f), g in zip(tried, again, strict=True)]
 
 
 def against(f: Fit, other: Fit) -> float:
