@@ -40,14 +40,14 @@ test: .venv/.dev ## build and test with colcon in a temporary folder, then run e
 bench: .venv/.dev ## measure speed beside C, scipy, pysindy and rosbags (ARGS=--quick; ARGS=--readme writes the README's table)
 	tools/setup compiler
 	tools/setup firmware
-	$(BIN)/python test/bench.py $(ARGS)
+	$(BIN)/python -m evaluation.bench $(ARGS)
 
 blind: .venv/.dev ## diagnose recordings of withheld effects, then open their labels (ARGS="--count 60 --seed 7")
-	PYTHONPATH=test $(BIN)/python -m blind $(ARGS)
+	$(BIN)/python -m evaluation.blind $(ARGS)
 
 soak: .venv/.runtime ## run a loop for 30 minutes under load, then with faults (ARGS="--minutes 5 --seed 3")
 	tools/setup firmware
-	PYTHONPATH=test $(BIN)/python -m soak $(ARGS)
+	$(BIN)/python -m evaluation.soak $(ARGS)
 
 coverage: .venv/.dev ## tell which lines no test without nodes reaches
 	$(BIN)/python -m pytest -q -n auto --dist loadscope -m "not live" --cov --cov-report=term-missing:skip-covered $(ARGS)

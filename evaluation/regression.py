@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether a change of the code changed a result: compare what two trees make of the same recordings.
 
-    python evaluation/regression.py inputs FOLDER            make the recordings (once)
-    python evaluation/regression.py run FOLDER NAME          results of this tree, in FOLDER/NAME
-    python evaluation/regression.py compare FOLDER OLD NEW   every number that differs (--rtol 0: to the bit)
+    python -m evaluation.regression inputs FOLDER            make the recordings (once)
+    python -m evaluation.regression run FOLDER NAME          results of this tree, in FOLDER/NAME
+    python -m evaluation.regression compare FOLDER OLD NEW   every number that differs (--rtol 0: to the bit)
 
 The recordings: 30 of calibrated rigs, 12 of uncalibrated driven rigs, 12 free decays and 6 sets of several recordings
 are diagnosed; 6 are identified; beside them the control table and a run of the plant with all effects.
@@ -26,20 +26,20 @@ from typing import Any
 import numpy as np
 from joblib import Parallel, delayed
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "test"))
-
-import control_table
-from aeropend_ident import identify, recording
-from aeropend_ident.gap.diagnosis import diagnose
-from aeropend_ident.gap.signals import from_recording
-from aeropend_ident.recording import RecordingError
-from aeropend_ident.results import document
-from aeropend_ident.usable import signals_of
-from aeropend_sim import rig
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import load
-from blind import __main__ as blind
-from blind import bags, cases, plant, unknown
+from aeropend_ident.bags import recording
+from aeropend_ident.bags.recording import RecordingError
+from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.results import document
+from aeropend_ident.identification import identify
+from aeropend_ident.signals.from_bag import signals_of
+from aeropend_ident.signals.signals import from_recording
+from aeropend_ident.testing import bags
+from aeropend_sim.model import rig
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import load
+from evaluation import control_table
+from evaluation.blind import __main__ as blind
+from evaluation.blind import cases, plant, uncalibrated
 
 SEED = 60_2026
 CALIBRATED, DRIVEN, DECAYS = 30, 12, 12
@@ -65,18 +65,18 @@ def inputs(folder: Path, jobs: int) -> None:
         bags.write(place / f"c{k:03d}", columns, round(plant.PERIOD * 1e9))
 
     def driven(k: int, effect: str) -> None:
-        _, columns, period = unknown.driven(f"u{k:03d}", effect, "table", nominal.model,
+        _, columns, period = uncalibrated.driven(f"u{k:03d}", effect, "table", nominal.model,
                                             nominal.sensing["angle_filter_tau"], SEED + 100 + k, 40.0)
         bags.write(place / f"u{k:03d}", columns, round(period * 1e9))
 
     def decay(k: int, damping: str) -> None:
-        _, columns, period = unknown.decay(f"d{k:03d}", damping, nominal.model, SEED + 200 + k)
+        _, columns, period = uncalibrated.decay(f"d{k:03d}", damping, nominal.model, SEED + 200 + k)
         bags.write(place / f"d{k:03d}", columns, round(period * 1e9))
 
-    effects = ["", "", *np.random.default_rng(SEED).permutation(unknown.SHOWS)[:DRIVEN - 2].tolist()]
+    effects = ["", "", *np.random.default_rng(SEED).permutation(uncalibrated.SHOWS)[:DRIVEN - 2].tolist()]
     Parallel(jobs)([*(delayed(calibrated)(k, row) for k, row in enumerate(blind.plan(CALIBRATED, SEED))),
                     *(delayed(driven)(k, e) for k, e in enumerate(effects)),
-                    *(delayed(decay)(k, unknown.DAMPING[k % 3]) for k in range(DECAYS))])
+                    *(delayed(decay)(k, uncalibrated.DAMPING[k % 3]) for k in range(DECAYS))])
 
 
 def diagnosed(folder: Path, names: tuple[str, ...], *, fit_nominal: bool) -> dict[str, Any]:

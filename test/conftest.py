@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parent / "support"))
 
-from graph import Graph, Process, isolate
+from evaluation.support.graph import Graph, Process, isolate
 
 isolate()
 

@@ -7,14 +7,13 @@ import re
 from dataclasses import asdict
 from pathlib import Path
 
-import bench
 import pytest
-import results
-from benchmarks import growth, history, readme
-from benchmarks.measure import Figure, Spread, Target
+from evaluation import bench, results
+from evaluation.benchmarks import growth, history, readme
+from evaluation.benchmarks.measure import Figure, Spread, Target
 
-from aeropend_ident.gap.hypotheses import hypotheses
-from aeropend_sim.parameters import load
+from aeropend_ident.diagnosis.search.hypotheses import hypotheses
+from aeropend_sim.model.parameters import load
 
 MACHINE = {"cpu": "one", "cores": 2, "python": "3.12.1", "numba": "1.0", "commit": "abc"}
 HERE = Path(__file__).parent

@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Board in the loop, in simulated time: what its samples, turned into SI by the bridge, say of the rig behind it."""
 
-import boards
 import numpy as np
 import pytest
 from board import Board
-from rigs import BENCH, steps
+from evaluation.support import boards
 
 from aeropend_bridge import calibration, protocol
-from aeropend_ident.gap.diagnosis import diagnose
-from aeropend_ident.gap.signals import Signals, from_arrays
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import SAMPLE_PERIOD
+from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.signals.signals import Signals, from_arrays
+from aeropend_ident.testing.rigs import BENCH, steps
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
 DURATION_S = 30.0
 

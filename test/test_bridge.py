@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from graph import Process, parameters, stamps
+from evaluation.support.graph import Process, parameters, stamps
 from pty_board import PtyBoard
 from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Float64
@@ -16,7 +16,7 @@ from std_srvs.srv import SetBool
 
 from aeropend_bridge import calibration
 from aeropend_bridge.protocol import Type
-from aeropend_sim.interface import ARMATURE, DUTY_COMMAND, JOINT_STATES
+from aeropend_sim.ros.interface import ARMATURE, DUTY_COMMAND, JOINT_STATES
 
 PERIOD_NS = 2_040_000
 

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from aeropend_sim.completion import commands
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import load, to_flat
+from aeropend_sim.cli.completion import commands
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import load, to_flat
 
 COMMANDS = {entry.name: entry for entry in commands()}
 MODEL = to_flat(load("bench").with_effects({effect.id: {name: p.default for name, p in effect.parameters.items()}
@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[1]
 DOCUMENTS = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("src/*/README.md")]
 
 BASH = """
-eval "$({python} -m aeropend_sim.completion)"
+eval "$({python} -m aeropend_sim.cli.completion)"
 COMP_LINE=$1 COMP_POINT=${{#1}} COMP_TYPE=9
 read -ra words <<<"$COMP_LINE"
 complete -p "${{words[0]##*/}}" >&2
@@ -36,7 +36,7 @@ printf '%s\\n' "${{COMPREPLY[@]}}"
 
 ZSH = """
 autoload -U compinit && compinit -u -D
-eval "$({python} -m aeropend_sim.completion)"
+eval "$({python} -m aeropend_sim.cli.completion)"
 show() {{ print -r -- "<$BUFFER>" }}
 zle -N show
 bindkey '^X' show
@@ -149,7 +149,8 @@ def test_help_leaves_the_process_as_it_was(capsys):
 
 
 def test_a_command_whose_reader_is_gone_ends_in_silence():
-    code = "from aeropend_sim.command import interruptible as i; exit(i(lambda: [print(k) for k in range(10**5)][0])())"
+    code = ("from aeropend_sim.cli.command import interruptible as i; "
+            "exit(i(lambda: [print(k) for k in range(10**5)][0])())")
     command = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert command.stdout.readline() == "0\n"
     command.stdout.close()

@@ -10,16 +10,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from graph import Process, parameters
+from evaluation.support.graph import Process, parameters
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool, Trigger
 
-from aeropend_control.laws import LAWS
-from aeropend_ident import step_response
-from aeropend_sim.interface import (
+from aeropend_control.laws.registry import LAWS
+from aeropend_ident.commands import step_response
+from aeropend_sim.ros.interface import (
     ARMATURE,
     DIAGNOSTICS,
     DUTY_COMMAND,

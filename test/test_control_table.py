@@ -4,10 +4,9 @@
 import io
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
-from control_table import BENCH, EFFECTS, figures, table
+from evaluation.control_table import BENCH, EFFECTS, figures, table
 from rich.console import Console
 
 HURT = ["thrust_lag", "encoder_lag", "axial_inflow", "coulomb_friction"]
@@ -38,7 +37,7 @@ def test_a_loop_that_does_not_come_to_rest_is_marked():
 
 def test_an_unknown_name_is_refused():
     for arguments in (["pid"], ["cascade", "--effects", "ghost"]):
-        done = subprocess.run([sys.executable, Path(__file__).with_name("control_table.py"), *arguments],
+        done = subprocess.run([sys.executable, "-m", "evaluation.control_table", *arguments],
                               capture_output=True, text=True, check=False)
         assert done.returncode == 2
         assert len(done.stderr.splitlines()) == 1

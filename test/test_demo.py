@@ -12,15 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from aeropend_ident.demo import NUMBER_ERROR, draw
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import load
+from aeropend_ident.commands.demo import NUMBER_ERROR, draw
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import load
 
 pytestmark = pytest.mark.live
 
 
 def demo(*arguments: object) -> subprocess.Popen[str]:
-    return subprocess.Popen([sys.executable, "-m", "aeropend_ident.demo", *map(str, arguments)],
+    return subprocess.Popen([sys.executable, "-m", "aeropend_ident.commands.demo", *map(str, arguments)],
                             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -50,8 +50,8 @@ def test_the_hidden_effect_is_named(finished):
 
 def test_its_verdict_needs_nothing_but_the_recording(finished, tmp_path):
     shutil.copytree(finished[3] / "recording", tmp_path / "a")
-    subprocess.run([sys.executable, "-m", "aeropend_ident.diagnose", "a", "--out", "verdict"], cwd=tmp_path, check=True,
-                   stdout=subprocess.DEVNULL)
+    subprocess.run([sys.executable, "-m", "aeropend_ident.commands.diagnose", "a", "--out", "verdict"], cwd=tmp_path,
+                   check=True, stdout=subprocess.DEVNULL)
     here, there = (json.loads((folder / "diagnosis.json").read_text())
                    for folder in (tmp_path / "verdict", finished[3] / "diagnosis"))
     assert here["which"] == there["which"]

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from aeropend_control.base import settings
-from aeropend_control.laws import LAWS
-from aeropend_ident import import_table
-from aeropend_ident.discrepancy import in_library
-from aeropend_sim.completion import commands
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import load
+from aeropend_control.laws.registry import LAWS
+from aeropend_control.nodes.controller import settings
+from aeropend_ident.commands import import_table
+from aeropend_ident.identification.discrepancy import in_library
+from aeropend_sim.cli.completion import commands
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import load
 
 ROOT = Path(__file__).parents[1]
 ROWS = {cells[0].strip(" `"): cells for cells in (line.strip("|").split("|") for line in

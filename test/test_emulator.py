@@ -11,12 +11,14 @@ from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 
-import boards
 import numpy as np
 import pytest
 import serial
 from board import ANGLE_ZERO, BROWN_OUT, EXTERNAL, PROGRAM, REFERENCE_V, Board, BoardError, Chip, Pins
-from boards import (
+from emulated_board import Fault, main
+from emulated_board import _model as read_model
+from evaluation.support import boards
+from evaluation.support.boards import (
     ACK,
     ASK_HELLO,
     BROWN_OUT_RESET,
@@ -45,10 +47,8 @@ from boards import (
     altered,
     quiet,
 )
-from emulated_board import Fault, main
-from emulated_board import _model as read_model
 
-from aeropend_sim.parameters import load
+from aeropend_sim.model.parameters import load
 
 OK, BAD_VALUE, UNKNOWN_TYPE, DISABLED = range(4)
 CURRENT_LSB = 2.56 / 1024 / 1.65

@@ -6,14 +6,14 @@ import time
 
 import numpy as np
 import pytest
-from graph import parameters, stamps
+from evaluation.support.graph import parameters, stamps
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import Float64
 
-from aeropend_control.excite import REPEAT, changes
-from aeropend_sim.excitation import KINDS, Excitation
-from aeropend_sim.interface import ARMATURE, DUTY_COMMAND, stamp
+from aeropend_control.nodes.excite import REPEAT, changes
+from aeropend_sim.model.excitation import KINDS, Excitation
+from aeropend_sim.ros.interface import ARMATURE, DUTY_COMMAND, stamp
 
 PERIOD_NS = 2_040_000
 

@@ -11,8 +11,8 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from boards import FIRMWARE, altered, build, frame
 from boot_loader import BootLoader
+from evaluation.support.boards import FIRMWARE, altered, build, frame
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -5,12 +5,12 @@ import math
 from itertools import pairwise
 
 import pytest
-from graph import parameters, stamps
+from evaluation.support.graph import parameters, stamps
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, ReliabilityPolicy
 from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Float64
 
-from aeropend_sim.interface import ARMATURE, DIAGNOSTICS, JOINT_STATES, TRUTH_ARMATURE, TRUTH_JOINT_STATES
+from aeropend_sim.ros.interface import ARMATURE, DIAGNOSTICS, JOINT_STATES, TRUTH_ARMATURE, TRUTH_JOINT_STATES
 
 PERIOD_NS = 2_040_000
 JOINT_STATE, BATTERY_STATE = "sensor_msgs/msg/JointState", "sensor_msgs/msg/BatteryState"

@@ -9,7 +9,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-from graph import MODULES, parameters
+from evaluation.support.graph import MODULES, parameters
 from rclpy.duration import Duration
 from rclpy.serialization import serialize_message
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -18,10 +18,18 @@ from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
 
-from aeropend_ident.record import TOPICS
-from aeropend_sim import interface
-from aeropend_sim.interface import ARMATURE, DUTY_COMMAND, ENABLE, JOINT_STATES, REFERENCE
-from aeropend_sim.transport import FOUND_BY_NAME, LOCALHOST, PROFILES, RANGE, SUBNET, TRANSPORTS, without_shared_memory
+from aeropend_ident.nodes.record import TOPICS
+from aeropend_sim.ros import interface
+from aeropend_sim.ros.interface import ARMATURE, DUTY_COMMAND, ENABLE, JOINT_STATES, REFERENCE
+from aeropend_sim.ros.transport import (
+    FOUND_BY_NAME,
+    LOCALHOST,
+    PROFILES,
+    RANGE,
+    SUBNET,
+    TRANSPORTS,
+    without_shared_memory,
+)
 
 ROOT = Path(__file__).parents[1]
 PEOPLE = {"operator", "viewer"}

@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 import rclpy
-from graph import Process, parameters, stamps
+from evaluation.support.graph import Process, parameters, stamps
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
 from rclpy.node import Node
@@ -18,12 +18,12 @@ from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool, Trigger
 
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.interface import ARMATURE, DUTY_COMMAND, JOINT_STATES
-from aeropend_sim.parameters import load, save
-from aeropend_sim.plant import BACKLOG, PERIOD_NS, Pace, read_parameters
-from aeropend_sim.rig import Rig
-from aeropend_sim.ros import overrides
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import load, save
+from aeropend_sim.model.rig import Rig
+from aeropend_sim.nodes.plant import BACKLOG, PERIOD_NS, Pace, read_parameters
+from aeropend_sim.ros.interface import ARMATURE, DUTY_COMMAND, JOINT_STATES
+from aeropend_sim.ros.program import overrides
 
 
 class FakeTime:

@@ -2,11 +2,11 @@
 """What robot_state_publisher gets of the rig."""
 
 import numpy as np
-from graph import parameters, stamps
+from evaluation.support.graph import parameters, stamps
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
 
-from aeropend_sim import interface
+from aeropend_sim.ros import interface
 
 
 def test_every_joint_has_a_position_that_moves_as_the_rig_does(graph, start):

@@ -5,13 +5,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from rigs import BENCH, drawn_rig
 
-from aeropend_ident.gap.diagnosis import diagnose
-from aeropend_ident.gap.signals import Signals, from_arrays
-from aeropend_sim import rig
-from aeropend_sim.excitation import Excitation
-from aeropend_sim.parameters import SAMPLE_PERIOD, Model
+from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.signals.signals import Signals, from_arrays
+from aeropend_ident.testing.rigs import BENCH, drawn_rig
+from aeropend_sim.model import rig
+from aeropend_sim.model.excitation import Excitation
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 
 SURE = 0.9
 

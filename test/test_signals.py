@@ -45,7 +45,7 @@ def test_a_signal_during_start_up_ends_the_plant(start, number):
 HANGING = """
 import sys, threading, time
 from rclpy.node import Node
-from aeropend_sim import ros
+from aeropend_sim.ros import program
 
 class Hanging(Node):
     def close(self):

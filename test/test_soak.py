@@ -12,18 +12,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import results
-from graph import PATIENCE_S
-from soak.__main__ import MINUTES, main, readme
-from soak.faults import FAULTS
-from soak.stand import PERIOD_NS, Clock, Promise, Stand, holes, missing
-from soak.steady import WARM_UP_S, Growth, busy, steady
+from evaluation import results
+from evaluation.soak.__main__ import MINUTES, main, readme
+from evaluation.soak.faults import FAULTS
+from evaluation.soak.stand import PERIOD_NS, Clock, Promise, Stand, holes, missing
+from evaluation.soak.steady import WARM_UP_S, Growth, busy, steady
+from evaluation.support.graph import PATIENCE_S
 
 SECONDS = 12.0
 ALONE = ("kill_controller", "stop_controller", "clock_step")
 """Others are tested where they belong (kill -9 and full disks in test_kill.py, the board in test_swap.py, ...), or take
 more than a test: `make soak`."""
-TEST = Path(__file__).parent
+ROOT = Path(__file__).parents[1]
 
 
 def broken(stand):
@@ -71,7 +71,7 @@ def processes(text):
 
 @pytest.mark.live
 def test_ctrl_c_ends_all_that_it_started():
-    soak = subprocess.Popen([sys.executable, "-m", "soak", "--minutes", "1"], cwd=TEST, text=True,
+    soak = subprocess.Popen([sys.executable, "-m", "evaluation.soak", "--minutes", "1"], cwd=ROOT, text=True,
                             stdout=subprocess.PIPE, stderr=subprocess.STDOUT)  # fmt: skip
     try:
         end = time.monotonic() + PATIENCE_S

@@ -9,13 +9,13 @@ import time
 
 import numpy as np
 import pytest
-import swap
-from graph import Process, parameters, stamps
+from evaluation import swap
+from evaluation.support.graph import Process, parameters, stamps
 from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Float64
 
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.interface import ARMATURE, JOINT_STATES, RESET
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.ros.interface import ARMATURE, JOINT_STATES, RESET
 
 NAMESPACE = "/rig"
 EFFECT, PLACE = "coulomb_friction", "arm"
@@ -147,7 +147,8 @@ def test_a_law_steps_both_rigs_alike(graph, tmp_path, law):
 @pytest.mark.alone
 def test_a_withheld_effect_is_found_from_a_recording_through_the_bridge(tmp_path):
     bag = tmp_path / "bag"
-    subprocess.run([sys.executable, swap.__file__, "record", bag, str(RECORDED_S), EFFECT], check=True, timeout=120)
+    subprocess.run([sys.executable, "-m", "evaluation.swap", "record", bag, str(RECORDED_S), EFFECT], check=True,
+                   timeout=120)
     with Process("diagnose", str(bag), "--out", str(tmp_path)) as diagnose:
         assert diagnose.wait(120.0) == 0, diagnose.output
     body = json.loads((tmp_path / "diagnosis.json").read_text())

@@ -5,16 +5,16 @@ from functools import cache
 
 import numpy as np
 import pytest
-from graph import stamps
+from evaluation.support.graph import stamps
+from evaluation.tuned_controller import M_P, T_S, case, error, nominal, table
 from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Float64
-from tuned_controller import M_P, T_S, case, error, nominal, table
 
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.interface import ARMATURE, DUTY_COMMAND, JOINT_STATES
-from aeropend_sim.parameters import load, save
-from aeropend_sim.plant import PERIOD_NS
-from aeropend_sim.rig import Rig
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import load, save
+from aeropend_sim.model.rig import Rig
+from aeropend_sim.nodes.plant import PERIOD_NS
+from aeropend_sim.ros.interface import ARMATURE, DUTY_COMMAND, JOINT_STATES
 
 EFFECTS = ("bridge_drop", "thrust_exponent", "coulomb_friction", "cable_torque", "angle_offset")
 

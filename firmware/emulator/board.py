@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from aeropend_sim import sensing
-from aeropend_sim.parameters import SAMPLE_PERIOD, Model, load
-from aeropend_sim.rig import Rig
+from aeropend_sim.model import sensing
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
+from aeropend_sim.model.rig import Rig
 
 BUILD = Path(__file__).parents[1] / "build"
 PROGRAM = BUILD / "aeropend.elf"

@@ -40,10 +40,10 @@ from board import (
     Outcome,
 )
 
-from aeropend_sim.command import Parser
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import PRESETS, Model, ModelError, _Loader, _node_parameters, from_flat, load
-from aeropend_sim.realtime import go_before_other_programs, monotonic_to_ros_ns, prepare_thread
+from aeropend_sim.cli.command import Parser
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import PRESETS, Model, ModelError, _Loader, _node_parameters, from_flat, load
+from aeropend_sim.ros.realtime import go_before_other_programs, monotonic_to_ros_ns, prepare_thread
 
 PERIOD_NS = PERIOD_CYCLES * 1_000_000_000 // CLOCK_HZ
 BACKLOG = 49

@@ -23,14 +23,14 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "excite = aeropend_control.excite:main",
-            "small_signal = aeropend_control.base:small_signal",
-            "feedback_linearization = aeropend_control.base:feedback_linearization",
-            "cascade = aeropend_control.base:cascade",
-            "feedback_linearization_cascade = aeropend_control.base:feedback_linearization_cascade",
-            "reference = aeropend_control.reference:main",
-            "step_test = aeropend_control.step_test:main",
-            "tune = aeropend_control.tune:main",
+            "excite = aeropend_control.nodes.excite:main",
+            "small_signal = aeropend_control.nodes.controller:small_signal",
+            "feedback_linearization = aeropend_control.nodes.controller:feedback_linearization",
+            "cascade = aeropend_control.nodes.controller:cascade",
+            "feedback_linearization_cascade = aeropend_control.nodes.controller:feedback_linearization_cascade",
+            "reference = aeropend_control.nodes.reference:main",
+            "step_test = aeropend_control.nodes.step_run:main",
+            "tune = aeropend_control.commands.tune:main",
         ]
     },
 )

@@ -9,7 +9,7 @@ setup(
     name=PACKAGE,
     version="0.1.0",
     packages=find_packages(exclude=["test", "test.*"]),
-    package_data={"aeropend_ident": ["gap/*.html.j2"]},
+    package_data={"aeropend_ident": ["diagnosis/report/templates/*.html.j2"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -26,16 +26,16 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "import = aeropend_ident.import_table:main",
-            "record = aeropend_ident.record:main",
-            "replay = aeropend_ident.replay:main",
-            "recover = aeropend_ident.recover:main",
-            "diagnose = aeropend_ident.diagnose:main",
-            "identify = aeropend_ident.identify:main",
-            "bench_test = aeropend_ident.bench_test:main",
-            "excitation_quality = aeropend_ident.quality:main",
-            "step_response = aeropend_ident.step_response:main",
-            "demo = aeropend_ident.demo:main",
+            "import = aeropend_ident.commands.import_table:main",
+            "record = aeropend_ident.nodes.record:main",
+            "replay = aeropend_ident.nodes.replay:main",
+            "recover = aeropend_ident.commands.recover:main",
+            "diagnose = aeropend_ident.commands.diagnose:main",
+            "identify = aeropend_ident.identification.identify:main",
+            "bench_test = aeropend_ident.commands.bench:main",
+            "excitation_quality = aeropend_ident.commands.excitation_quality:main",
+            "step_response = aeropend_ident.commands.step_response:main",
+            "demo = aeropend_ident.commands.demo:main",
         ]
     },
 )

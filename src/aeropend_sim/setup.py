@@ -25,5 +25,5 @@ setup(
     maintainer_email="maintainers@aeropend.example",
     description="The aeropendulum's model (dynamics, actuator, sensing, effects) and the simulated plant node.",
     license="Apache-2.0",
-    entry_points={"console_scripts": ["plant = aeropend_sim.plant:main", "pose = aeropend_sim.pose:main"]},
+    entry_points={"console_scripts": ["plant = aeropend_sim.nodes.plant:main", "pose = aeropend_sim.nodes.pose:main"]},
 )

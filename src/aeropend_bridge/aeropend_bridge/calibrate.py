@@ -20,8 +20,8 @@ from aeropend_bridge import calibration, protocol
 from aeropend_bridge.calibration import Calibration
 from aeropend_bridge.link import Link, LinkError
 from aeropend_bridge.protocol import Flag, Hello, Message, Mode, Sample, Scheme
-from aeropend_sim.command import EXIT_CODES, Parser, interruptible
-from aeropend_sim.progress import Show, nothing, progress
+from aeropend_sim.cli.command import EXIT_CODES, Parser, interruptible
+from aeropend_sim.cli.progress import Show, nothing, progress
 
 PATIENCE_S = 5.0
 """How long the board may take to answer; a Mega's boot loader takes 1 s."""

@@ -13,7 +13,7 @@ from aeropend_bridge import calibration
 from aeropend_bridge.calibrate import CalibrationError, mean_on_circle, middle, zeros
 from aeropend_bridge.calibration import default, load, save
 from aeropend_bridge.protocol import Flag, Sample
-from aeropend_sim.parameters import load as load_model
+from aeropend_sim.model.parameters import load as load_model
 
 REST = Sample(0, 0, 0, 0, 0, 0, 0, 0)
 

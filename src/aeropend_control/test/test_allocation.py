@@ -2,12 +2,12 @@
 import numpy as np
 import pytest
 
-from aeropend_control.allocation import Allocation
-from aeropend_control.observer import Observer
-from aeropend_sim import actuator, dynamics
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import Model, load
-from aeropend_sim.rig import Rig
+from aeropend_control.laws.allocation import Allocation
+from aeropend_control.laws.observer import Observer
+from aeropend_sim.model import actuator, dynamics
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import Model, load
+from aeropend_sim.model.rig import Rig
 
 BENCH = load("bench")
 MOTOR = ["bridge_drop", "supply_sag", "brush_drop", "rotor_friction", "thrust_exponent"]

@@ -4,11 +4,11 @@ import math
 import numpy as np
 import pytest
 
-from aeropend_control import closed_loop
-from aeropend_control.cascade import THESIS_GAINS, Cascade, FeedbackLinearizationCascade
-from aeropend_control.step_response import step_responses
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import load
+from aeropend_control.analysis import closed_loop
+from aeropend_control.analysis.step_response import step_responses
+from aeropend_control.laws.cascade import THESIS_GAINS, Cascade, FeedbackLinearizationCascade
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import load
 
 BENCH = load("bench")
 RPM = 2.0 * math.pi / 60.0

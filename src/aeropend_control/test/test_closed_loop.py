@@ -2,9 +2,9 @@
 import numpy as np
 import pytest
 
-from aeropend_control import closed_loop
-from aeropend_sim.parameters import SAMPLE_PERIOD, load
-from aeropend_sim.rig import Rig, record
+from aeropend_control.analysis import closed_loop
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, load
+from aeropend_sim.model.rig import Rig, record
 
 BENCH = load("bench")
 

@@ -4,13 +4,13 @@ import math
 import numpy as np
 import pytest
 
-from aeropend_control import closed_loop
-from aeropend_control.feedback_linearization import THESIS_GAINS, FeedbackLinearization, tune
-from aeropend_control.step_response import step_responses
-from aeropend_control.tuning import TuningError
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import Model, load
-from aeropend_sim.rig import Rig, Sample
+from aeropend_control.analysis import closed_loop
+from aeropend_control.analysis.step_response import step_responses
+from aeropend_control.analysis.tuning import TuningError
+from aeropend_control.laws.feedback_linearization import THESIS_GAINS, FeedbackLinearization, tune
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import Model, load
+from aeropend_sim.model.rig import Rig, Sample
 
 BENCH, THESIS = load("bench"), load("thesis")
 NOT_OF_THE_ANGLE = ("current_gain", "current_offset", "voltage_offset", "speed_spikes")

@@ -6,12 +6,12 @@ import math
 import numpy as np
 import pytest
 
-from aeropend_control import closed_loop
-from aeropend_control.gains import Gain, GainError, checked
-from aeropend_control.laws import LAWS, TABLE_6_1, TuningError
-from aeropend_control.step_response import step_responses
-from aeropend_sim.parameters import load
-from aeropend_sim.rig import Rig, Sample
+from aeropend_control.analysis import closed_loop
+from aeropend_control.analysis.step_response import step_responses
+from aeropend_control.laws.gains import Gain, GainError, checked
+from aeropend_control.laws.registry import LAWS, TABLE_6_1, TuningError
+from aeropend_sim.model.parameters import load
+from aeropend_sim.model.rig import Rig, Sample
 
 BENCH, THESIS = load("bench"), load("thesis")
 GOAL = {name: 0.4 if kind.measures == "theta" else 90.0 for name, kind in LAWS.items()}

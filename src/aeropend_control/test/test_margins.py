@@ -4,10 +4,10 @@ import math
 import numpy as np
 import pytest
 
-from aeropend_control import closed_loop
-from aeropend_control.laws import LAWS
-from aeropend_control.margins import MarginError, from_response, margins
-from aeropend_sim.parameters import load
+from aeropend_control.analysis import closed_loop
+from aeropend_control.analysis.margins import MarginError, from_response, margins
+from aeropend_control.laws.registry import LAWS
+from aeropend_sim.model.parameters import load
 
 BENCH = load("bench")
 

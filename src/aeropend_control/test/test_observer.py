@@ -4,10 +4,10 @@ import math
 import numpy as np
 import pytest
 
-from aeropend_control.observer import Observer
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import load
-from aeropend_sim.rig import Rig
+from aeropend_control.laws.observer import Observer
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import load
+from aeropend_sim.model.rig import Rig
 
 BENCH, THESIS = load("bench"), load("thesis")
 NOT_OF_THE_ANGLE = ("current_gain", "current_offset", "voltage_offset", "speed_spikes")

@@ -3,7 +3,7 @@ import math
 
 import pytest
 
-from aeropend_control.pid import PID
+from aeropend_control.laws.pid import PID
 
 T = 0.01
 

@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from aeropend_control.reference_model import ReferenceModel
+from aeropend_control.laws.reference_model import ReferenceModel
 
 T = 0.002
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 import pytest
 
-from aeropend_control import closed_loop
-from aeropend_control.small_signal import THESIS_GAINS, SmallSignal
-from aeropend_control.step_response import step_responses
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import load
+from aeropend_control.analysis import closed_loop
+from aeropend_control.analysis.step_response import step_responses
+from aeropend_control.laws.small_signal import THESIS_GAINS, SmallSignal
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import load
 
 BENCH, THESIS = load("bench"), load("thesis")
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from aeropend_control.step_response import StepError, step_responses
-from aeropend_sim.parameters import SAMPLE_PERIOD
+from aeropend_control.analysis.step_response import StepError, step_responses
+from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
 TIME = SAMPLE_PERIOD * np.arange(4000)
 LSB = 2.0 * math.pi / 1024

@@ -3,9 +3,9 @@ import math
 
 import pytest
 
-from aeropend_control.supervisor import Supervisor
-from aeropend_sim.parameters import SAMPLE_PERIOD
-from aeropend_sim.rig import Sample
+from aeropend_control.nodes.supervisor import Supervisor
+from aeropend_sim.model.parameters import SAMPLE_PERIOD
+from aeropend_sim.model.rig import Sample
 
 PERIOD_NS = round(SAMPLE_PERIOD * 1e9)
 

@@ -3,8 +3,8 @@ import re
 
 import pytest
 
-from aeropend_control.laws import LAWS
-from aeropend_control.tune import main
+from aeropend_control.commands.tune import main
+from aeropend_control.laws.registry import LAWS
 
 
 def test_it_prints_gains_answers_and_margins(capsys):

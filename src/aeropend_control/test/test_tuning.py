@@ -4,10 +4,18 @@ import math
 import numpy as np
 import pytest
 
-from aeropend_control.tuning import TABLE_6_1, Requirements, TuningError, pair, place, settling_time, thrust_lag
-from aeropend_sim import actuator
-from aeropend_sim.parameters import load
-from aeropend_sim.rig import Rig
+from aeropend_control.analysis.tuning import (
+    TABLE_6_1,
+    Requirements,
+    TuningError,
+    pair,
+    place,
+    settling_time,
+    thrust_lag,
+)
+from aeropend_sim.model import actuator
+from aeropend_sim.model.parameters import load
+from aeropend_sim.model.rig import Rig
 
 BENCH, THESIS = load("bench"), load("thesis")
 

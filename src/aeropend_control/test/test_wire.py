@@ -7,8 +7,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Float64
 
-from aeropend_control import wire
-from aeropend_sim import interface
+from aeropend_control.nodes import wire
+from aeropend_sim.ros import interface
 
 STAMP = 1_795_303_606_684_245_755
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
-from aeropend_ident.bag import Bag, RecordingError
-from aeropend_ident.recording import CHANNELS, read
+from aeropend_ident.bags.bag import Bag, RecordingError
+from aeropend_ident.bags.recording import CHANNELS, read
 
 QOS = """- history: 3
   depth: 0
@@ -468,7 +468,7 @@ def test_folder_that_may_not_be_read(bags, processes, request):
     path = bags.write(folder / "bag", bags.content(5))
     code = f"""
 import os, sys
-from aeropend_ident.recording import RecordingError, read
+from aeropend_ident.bags.recording import RecordingError, read
 if os.geteuid() == 0:
     os.setuid(65534)
 try:

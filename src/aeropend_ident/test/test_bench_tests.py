@@ -8,12 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from aeropend_ident import bench_test, bench_tests, thesis
-from aeropend_ident.bench_tests import BenchTestError, Estimate, Rows
-from aeropend_ident.thesis import TABLE_4_1, TABLE_4_2
-from aeropend_sim import actuator, rig
-from aeropend_sim.excitation import Excitation
-from aeropend_sim.parameters import SAMPLE_PERIOD, Model, load
+from aeropend_ident.bench_tests import estimates
+from aeropend_ident.bench_tests.estimates import BenchTestError, Estimate, Rows
+from aeropend_ident.commands import bench
+from aeropend_ident.studies import thesis
+from aeropend_ident.studies.thesis import TABLE_4_1, TABLE_4_2
+from aeropend_sim.model import actuator, rig
+from aeropend_sim.model.excitation import Excitation
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
 
 BENCH = load("bench")
 
@@ -49,12 +51,12 @@ def table(columns, name="table"):
 
 
 def test_table_4_1_gives_the_resistance_the_thesis_prints():
-    found = bench_tests.blocked_rotor(TABLE_4_1).numbers["R_a"]
+    found = estimates.blocked_rotor(TABLE_4_1).numbers["R_a"]
     assert f"{found.value:.2f} {found.scatter:.2f}" == "1.08 0.04"
 
 
 def test_table_4_2_gives_the_constant_the_thesis_prints_in_volts_per_rpm():
-    found = bench_tests.steady(TABLE_4_2, Estimate(1.08, 0.0, "Ω", "Table 4.1"))
+    found = estimates.steady(TABLE_4_2, Estimate(1.08, 0.0, "Ω", "Table 4.1"))
     printed = found.others["K_e in V/RPM"]
     assert printed.value == pytest.approx(6.606442526e-4, rel=2e-4)
     assert printed.scatter == pytest.approx(1.377310893e-5, rel=1e-2)
@@ -74,18 +76,18 @@ def test_chapter_4_is_printed_beside_what_comes_out(capsys):
 
 
 def test_equation_4_5_is_the_inverse_of_4_4():
-    p, q, r, s = bench_tests.thrust_to_voltage(0.054, 0.0435, 0.0029)
+    p, q, r, s = estimates.thrust_to_voltage(0.054, 0.0435, 0.0029)
     assert [round(x, 4) for x in (p, q, r, s)] == [-0.4028, 9.2593, 0.0013, 0.216]
     v = np.linspace(0.1, 2.3, 20)
     assert p + q * np.sqrt(r + s * (0.054 * v**2 + 0.0435 * v + 0.0029)) == pytest.approx(v)
     with pytest.raises(ValueError, match="inverse"):
-        bench_tests.thrust_to_voltage(-1.0, 1.0, 0.0)
+        estimates.thrust_to_voltage(-1.0, 1.0, 0.0)
 
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("early", [0.0, -0.00102])
 def test_a_blocked_rotor_gives_resistance_and_inductance_wherever_in_the_period_the_duty_acts(seed, early):
-    found = bench_tests.blocked_recording(blocked(seed, {"command_delay": {"delay": early}} if early else {}), "bag")
+    found = estimates.blocked_recording(blocked(seed, {"command_delay": {"delay": early}} if early else {}), "bag")
     assert holds(found.numbers["L_a"], BENCH.model["L_a"])
     assert found.numbers["R_a"].value == pytest.approx(BENCH.model["R_a"], rel=1e-3)
 
@@ -99,14 +101,14 @@ def test_the_stairs_of_a_recording_give_the_numbers_of_its_rig(seed):
     duty = Excitation("staircase", duration=160.0, duty_max=0.5).series()
     read = recorded(Model("rig", numbers, BENCH.sensing, {}), duty, seed)
     base = Model("bench", {**BENCH.model, "R_a": numbers["R_a"]}, BENCH.sensing, {})
-    found = bench_test.work_out({"steady": read, "duty-map": read, "thrust": read}, base)
+    found = bench.work_out({"steady": read, "duty-map": read, "thrust": read}, base)
     assert holds(found["steady"].numbers["K_e"], numbers["K_e"])
     assert holds(found["steady"].numbers["k_load"], numbers["k_load"])
     assert found["steady"].numbers["B_m"].value == 0.0
     assert holds(found["thrust"].numbers["k_thrust"], numbers["k_thrust"])
     assert holds(found["thrust"].others["exponent of ω"], 2.0)
     assert not any("rather than" in note for note in found["thrust"].notes)
-    model = bench_test.augmented(base, found)
+    model = bench.augmented(base, found)
     x = np.linspace(0.05, 0.5, 50)
     assert actuator.voltage(model.model, x) == pytest.approx(actuator.voltage(numbers, x), abs=2e-3)
 
@@ -114,7 +116,7 @@ def test_the_stairs_of_a_recording_give_the_numbers_of_its_rig(seed):
 def test_another_exponent_of_the_thrust_is_said():
     w = np.linspace(60.0, 220.0, 12)
     f = 7.67e-6 * 150.0**2 * (w / 150.0) ** 1.8 * (1.0 + 0.01 * np.random.default_rng(0).standard_normal(12))
-    found = bench_tests.thrust_curve(table({"omega": w, "thrust": f}), BENCH.model)
+    found = estimates.thrust_curve(table({"omega": w, "thrust": f}), BENCH.model)
     assert holds(found.others["exponent of ω"], 1.8)
     assert "rather than" in found.notes[0]
 
@@ -123,18 +125,18 @@ def test_a_current_step_gives_its_time_constant():
     t = np.arange(0.0, 0.05, 2e-4)
     noise = 2e-3 * np.random.default_rng(0).standard_normal(len(t))
     i = np.where(t > 0.0101, 0.9 * -np.expm1(-(t - 0.0101) / 0.002), 0.0) + noise
-    found = bench_tests.current_step(table({"t": t, "i_a": i}), Estimate(1.08, 0.01, "Ω", ""))
+    found = estimates.current_step(table({"t": t, "i_a": i}), Estimate(1.08, 0.01, "Ω", ""))
     assert holds(found.others["τ_e"], 0.002)
     assert holds(found.numbers["L_a"], 0.00216)
     assert not found.notes
-    rough = bench_tests.current_step(table({"t": t[::30], "i_a": i[::30]}), Estimate(1.08, 0.01, "Ω", ""))
+    rough = estimates.current_step(table({"t": t[::30], "i_a": i[::30]}), Estimate(1.08, 0.01, "Ω", ""))
     assert "sample faster" in rough.notes[0]
 
 
 def test_an_offset_of_a_reading_is_said():
     i = np.linspace(0.3, 2.0, 15)
     v = 1.08 * i + 0.1 + 1e-3 * np.random.default_rng(0).standard_normal(15)
-    assert "0.1 V" in bench_tests.blocked_rotor(table({"v_a": v, "i_a": i})).notes[0]
+    assert "0.1 V" in estimates.blocked_rotor(table({"v_a": v, "i_a": i})).notes[0]
 
 
 def write(path, text):
@@ -147,7 +149,7 @@ def test_the_command_writes_a_model_that_says_where_its_numbers_come_from(tmp_pa
     speeds = write(tmp_path / "speeds.csv", "omega [rpm],v_a [V],i_a [A]\n1158,1.08,0.29\n1402,1.377,0.4\n1638,1.666,"
                    "0.55\n1885,1.974,0.7\n")
     out = tmp_path / "out"
-    assert bench_test.main(["--blocked-rotor", pairs, "--steady", speeds, "--out", str(out)]) == 0
+    assert bench.main(["--blocked-rotor", pairs, "--steady", speeds, "--out", str(out)]) == 0
     body = json.loads((out / "bench_tests.json").read_text())
     r = np.mean([0.48 / 0.44, 1.42 / 1.3, 0.89 / 0.85, 2.44 / 2.28])
     assert body["blocked-rotor"]["numbers"]["R_a"]["value"] == pytest.approx(r)
@@ -163,7 +165,7 @@ def test_the_command_writes_a_model_that_says_where_its_numbers_come_from(tmp_pa
     assert (out / "bench_tests.svg").read_text().count("<circle") == 12
     said = capsys.readouterr().out
     assert "R_a = " in said
-    assert bench_test.main(["--blocked-rotor", pairs, "--out", str(out)]) == 2
+    assert bench.main(["--blocked-rotor", pairs, "--out", str(out)]) == 2
     assert "--overwrite" in capsys.readouterr().err
 
 
@@ -187,7 +189,7 @@ def test_the_command_writes_a_model_that_says_where_its_numbers_come_from(tmp_pa
 ])
 def test_bad_tables_give_one_line(option, text, said, tmp_path, capsys):
     path = write(tmp_path / "table.csv", text)
-    assert bench_test.main([option, path, "--out", str(tmp_path / "out")]) == 2
+    assert bench.main([option, path, "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
     assert said in error
     assert error.count("\n") == 1
@@ -197,11 +199,11 @@ def test_bad_tables_give_one_line(option, text, said, tmp_path, capsys):
 def test_recordings_that_say_nothing_are_refused():
     moved = recorded(BENCH, Excitation("steps", duration=4.0, hold_max=1.0).series())
     with pytest.raises(BenchTestError, match="the rotor turned"):
-        bench_tests.blocked_recording(moved, "bag")
+        estimates.blocked_recording(moved, "bag")
     with pytest.raises(BenchTestError, match="settle"):
-        bench_tests.plateaus(moved, ("theta",), "bag")
+        estimates.plateaus(moved, ("theta",), "bag")
     with pytest.raises(BenchTestError, match="no current"):
-        bench_tests.blocked_recording(blocked(0, high=1e-9), "bag")
+        estimates.blocked_recording(blocked(0, high=1e-9), "bag")
 
 
 def test_the_command_takes_bags(bags, tmp_path):
@@ -211,7 +213,7 @@ def test_the_command_takes_bags(bags, tmp_path):
         columns = {c: getattr(read, c) for c in ("theta", "omega", "i_a", "v_a", "duty")}
         paths[name] = str(bags.write(tmp_path / name, bags.content(len(read), columns=columns)))
     out = tmp_path / "out"
-    assert bench_test.main(["--blocked-rotor", paths["blocked_bag"], "--steady", paths["stairs_bag"], "--duty-map",
+    assert bench.main(["--blocked-rotor", paths["blocked_bag"], "--steady", paths["stairs_bag"], "--duty-map",
                             paths["stairs_bag"], "--out", str(out), "--model", "thesis"]) == 0
     found = load(out / "bench.yaml").model
     for name in ("R_a", "L_a", "K_e", "k_load"):

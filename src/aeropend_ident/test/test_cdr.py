@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from aeropend_ident import cdr
+from aeropend_ident.bags import cdr
 
 JOINT, BATTERY = "sensor_msgs/msg/JointState", "sensor_msgs/msg/BatteryState"
 

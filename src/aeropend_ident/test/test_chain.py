@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigs import BENCH, recorded
 
-from aeropend_ident.gap.chain import BLOCKS, Chain, Chains
-from aeropend_ident.gap.fit import Search
-from aeropend_ident.gap.unknowns import nominal_unknowns
-from aeropend_sim import actuator
-from aeropend_sim.parameters import SAMPLE_PERIOD
+from aeropend_ident.diagnosis.chain.chain import BLOCKS, Chain, Chains
+from aeropend_ident.diagnosis.chain.priors import nominal_unknowns
+from aeropend_ident.estimation.map_fit import Search
+from aeropend_ident.testing.rigs import BENCH, recorded
+from aeropend_sim.model import actuator
+from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from aeropend_ident.derivatives import differences, noise_of, smoothed, tv_derivative
+from aeropend_ident.signals.derivatives import differences, noise_of, smoothed, tv_derivative
 
 PERIOD = 0.002
 

@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import Command
-from rigs import BENCH, drawn_rig, steps
 
-from aeropend_ident.results import experiment
-from aeropend_sim import rig
-from aeropend_sim.excitation import Excitation
-from aeropend_sim.parameters import load
+from aeropend_ident.diagnosis.results import experiment
+from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
+from aeropend_sim.model import rig
+from aeropend_sim.model.excitation import Excitation
+from aeropend_sim.model.parameters import load
 
 KEYS = ["format", "bags", "model", "duration_s", "samples", "train_s", "held_out_s", "channels", "where", "which",
         "shrink", "notes", "seconds"]
 
 
-COMMAND = Command("aeropend_ident.diagnose")
+COMMAND = Command("aeropend_ident.commands.diagnose")
 run, refused = COMMAND.run, COMMAND.refused
 
 

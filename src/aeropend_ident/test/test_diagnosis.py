@@ -5,16 +5,16 @@ import json
 
 import numpy as np
 import pytest
-from blind import cases
-from rigs import BENCH, drawn_rig, recorded, steps
+from evaluation.blind import cases
 
-from aeropend_ident.gap.diagnosis import diagnose
-from aeropend_ident.gap.signals import from_arrays
-from aeropend_ident.results import verdict_lines
-from aeropend_sim import rig
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.excitation import Excitation
-from aeropend_sim.parameters import SAMPLE_PERIOD, Model
+from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.results import verdict_lines
+from aeropend_ident.signals.signals import from_arrays
+from aeropend_ident.testing.rigs import BENCH, drawn_rig, recorded, steps
+from aeropend_sim.model import rig
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.excitation import Excitation
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 
 RANDOM = {"gust", "speed_spikes"}
 

@@ -21,13 +21,14 @@ from hypothesis import strategies as st
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
-from aeropend_control import steps
-from aeropend_ident import many, recover
-from aeropend_ident.bag import RecordingError
-from aeropend_ident.cdr import LONGEST, decode
-from aeropend_ident.diagnose import print_table
-from aeropend_ident.msgtypes import message_class
-from aeropend_ident.recording import read
+from aeropend_control.analysis import step_report
+from aeropend_ident.bags.bag import RecordingError
+from aeropend_ident.bags.cdr import LONGEST, decode
+from aeropend_ident.bags.msgtypes import message_class
+from aeropend_ident.bags.recording import read
+from aeropend_ident.commands import recover
+from aeropend_ident.commands.diagnose import print_table
+from aeropend_ident.diagnosis import batch
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -333,8 +334,8 @@ ZEROS = 1 << 31
 BOMB = """
 import resource, sys
 from pathlib import Path
-from aeropend_ident.bag import RecordingError
-from aeropend_ident.recording import read
+from aeropend_ident.bags.bag import RecordingError
+from aeropend_ident.bags.recording import read
 resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 try:
@@ -398,8 +399,8 @@ def test_a_table_shows_names_and_runs_none(capsys):
 @pytest.mark.parametrize("name", ["=HYPERLINK(\"http://x\")", "+1", "-2", "@SUM(A1)", "=cmd|' /C calc'!A0", "a\nb",
                                   "a\udcff"])
 def test_the_summary_holds_no_formulas(tmp_path, name):
-    many.write_summary(tmp_path, [many.row(many.Outcome(name, None, f"{name}: no such file"), "x")])
-    with (tmp_path / many.SUMMARY).open(encoding="utf-8", newline="") as file:
+    batch.write_summary(tmp_path, [batch.row(batch.Outcome(name, None, f"{name}: no such file"), "x")])
+    with (tmp_path / batch.SUMMARY).open(encoding="utf-8", newline="") as file:
         (row,) = csv.DictReader(file)
     assert not any(value.startswith(("=", "+", "-", "@", "\t", "\r")) for value in row.values())
     assert row["recording"].isprintable()
@@ -408,7 +409,7 @@ def test_the_summary_holds_no_formulas(tmp_path, name):
 
 def test_a_drawing_shows_names_as_text():
     t = np.linspace(0.0, 1.0, 50)
-    drawing = steps.draw(t, t, t, t, f"{HOSTILE}\x1b\udcff", "rad")
+    drawing = step_report.draw(t, t, t, t, f"{HOSTILE}\x1b\udcff", "rad")
     assert "<script" not in drawing
     assert "<img" not in drawing
     drawing.encode()

@@ -6,16 +6,16 @@ import json
 import numpy as np
 import pytest
 from commands import Command
-from rigs import BENCH
 
-from aeropend_sim import parameters, rig
-from aeropend_sim.excitation import Excitation
-from aeropend_sim.parameters import Model
+from aeropend_ident.testing.rigs import BENCH
+from aeropend_sim.model import parameters, rig
+from aeropend_sim.model.excitation import Excitation
+from aeropend_sim.model.parameters import Model
 
 KEYS = ["format", "method", "terms", "equations", "sigma", "held_out_mse", "seconds"]
 
 
-COMMAND = Command("aeropend_ident.identify")
+COMMAND = Command("aeropend_ident.identification.identify")
 run, refused = COMMAND.run, COMMAND.refused
 
 

@@ -10,13 +10,13 @@ import pytest
 import yaml
 from arm_tables import ANGLE, DUTY, MAPPED, NUMBERS, TIME, comma, imported, lines, put, refused
 
-from aeropend_ident import diagnose
-from aeropend_ident.cdr import decode, encode
-from aeropend_ident.import_table import main
-from aeropend_ident.recording import read
-from aeropend_sim.excitation import Excitation
-from aeropend_sim.parameters import load
-from aeropend_sim.rig import record
+from aeropend_ident.bags.cdr import decode, encode
+from aeropend_ident.bags.recording import read
+from aeropend_ident.commands import diagnose
+from aeropend_ident.commands.import_table import main
+from aeropend_sim.model.excitation import Excitation
+from aeropend_sim.model.parameters import load
+from aeropend_sim.model.rig import record
 
 
 def proposed(capsys, path):

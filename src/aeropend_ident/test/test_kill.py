@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import Reader
 
-from aeropend_ident.bag import Bag
-from aeropend_ident.recording import read
-from aeropend_ident.recover import recover
+from aeropend_ident.bags.bag import Bag
+from aeropend_ident.bags.recording import read
+from aeropend_ident.commands.recover import recover
 
 UNFINISHED = "the recording was not closed (killed, or still running): it may end up to a second early"
 
@@ -21,7 +21,7 @@ UNFINISHED = "the recording was not closed (killed, or still running): it may en
 @pytest.fixture
 def plant(processes):
     """Run a simulated rig."""
-    running = processes.start(module="aeropend_sim.plant")
+    running = processes.start(module="aeropend_sim.nodes.plant")
     yield running
     assert running.poll() is None
     assert processes.end(running)[0] == 0
@@ -29,7 +29,7 @@ def plant(processes):
 
 def start(processes, out, *parameters, **options):
     arguments = [word for one in parameters for word in ("-p", one)]
-    return processes.start(str(out), "--ros-args", *arguments, module="aeropend_ident.record", **options)
+    return processes.start(str(out), "--ros-args", *arguments, module="aeropend_ident.nodes.record", **options)
 
 
 def messages(path):

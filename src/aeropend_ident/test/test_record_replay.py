@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import Reader
 
-from aeropend_ident.bag import Bag
-from aeropend_ident.record import Tap, losses
-from aeropend_ident.recording import read
-from aeropend_ident.replay import Plan
+from aeropend_ident.bags.bag import Bag
+from aeropend_ident.bags.recording import read
+from aeropend_ident.nodes.record import Tap, losses
+from aeropend_ident.nodes.replay import Plan
 
 FLOAT = "std_msgs/msg/Float64"
 
@@ -25,8 +25,8 @@ from rclpy.duration import Duration
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Float64
-from aeropend_sim import interface
-from aeropend_sim.transport import without_shared_memory
+from aeropend_sim.ros import interface
+from aeropend_sim.ros.transport import without_shared_memory
 
 count, namespace = int(sys.argv[1]), sys.argv[2]
 qos = interface.QOS
@@ -63,7 +63,7 @@ rclpy.shutdown()
 SLOW_DISK = """
 '''A recorder whose disk takes 10 ms for a message once it was asked to end.'''
 import sys, time
-from aeropend_ident import record
+from aeropend_ident.nodes import record
 
 class Disk(record.BagWriter):
     slow = False
@@ -85,7 +85,7 @@ sys.exit(record.main())
 def record(processes, out, *parameters, remap=(), code="", **options):
     """Start recording; return when it does."""
     arguments = ["--ros-args", *(word for one in parameters for word in ("-p", one)), *remap]
-    module = "" if code else "aeropend_ident.record"
+    module = "" if code else "aeropend_ident.nodes.record"
     process = processes.start(str(out), *arguments, module=module, code=code, **options)
     deadline = time.monotonic() + 60
     while not (processes.folder / out / "metadata.yaml").exists():
@@ -104,7 +104,7 @@ def feed(processes, count, namespace="/", *options):
 
 def replay(processes, bag, *parameters, remap=()):
     arguments = ["--ros-args", *(word for one in parameters for word in ("-p", one)), *remap]
-    return processes.start(str(bag), *arguments, module="aeropend_ident.replay")
+    return processes.start(str(bag), *arguments, module="aeropend_ident.nodes.replay")
 
 
 def topics(path):
@@ -311,7 +311,7 @@ PLANT = ("/armature", "sensor_msgs/msg/BatteryState")
 
 def test_a_recorded_duty_drives_the_plant_and_leaves_it_at_rest(bags, processes):
     bags.write(processes.folder / "commands", commands(bags, [0.25, 0.5, 0.125, 0.375], 500_000_000))
-    plant = processes.start(module="aeropend_sim.plant")
+    plant = processes.start(module="aeropend_sim.nodes.plant")
     recorder = record(processes, "bag")
     deadline = time.monotonic() + 60  # the recorder hears the plant before it is driven
     while not (processes.folder / "bag" / "metadata.yaml").exists() or not counts(processes.folder / "bag")[PLANT]:
@@ -457,7 +457,7 @@ def test_record_refuses(processes, arguments, message):
     (processes.folder / "there").mkdir()
     (processes.folder / "there" / "thesis.pdf").write_text("mine")
     (processes.folder / "file").write_text("mine")
-    assert message in one_line(processes.start(*arguments, module="aeropend_ident.record"), "record")
+    assert message in one_line(processes.start(*arguments, module="aeropend_ident.nodes.record"), "record")
     assert sorted(file.name for file in processes.folder.iterdir()) == ["file", "there"]
     assert (processes.folder / "there" / "thesis.pdf").read_text() == "mine"
 
@@ -487,7 +487,7 @@ def test_replay_refuses(bags, processes, arguments, message):
 
     bags.store.register(get_types_from_msg("float64 x", "no_msgs/msg/No"))
     bags.write(processes.folder / "strange", bags.Content([("/strange", "no_msgs/msg/No", 5, bags.number(1.0))]))
-    assert message in one_line(processes.start(*arguments, module="aeropend_ident.replay"), "replay")
+    assert message in one_line(processes.start(*arguments, module="aeropend_ident.nodes.replay"), "replay")
 
 
 def test_overwrite_replaces_a_bag(bags, processes):
@@ -514,7 +514,7 @@ def test_progress_on_a_terminal(processes):
 
     own, theirs = pty.openpty()
     recorder = processes.start("bag", "--ros-args", "-p", "while_published:=joint_states",
-                               module="aeropend_ident.record", stderr=theirs)  # fmt: skip
+                               module="aeropend_ident.nodes.record", stderr=theirs)  # fmt: skip
     os.close(theirs)
     feed(processes, 1500)
     said = b""

@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from aeropend_ident.recording import CHANNELS, RecordingError, read
+from aeropend_ident.bags.recording import CHANNELS, RecordingError, read
 
 JOINT, BATTERY, FLOAT = "sensor_msgs/msg/JointState", "sensor_msgs/msg/BatteryState", "std_msgs/msg/Float64"
 NAN = math.nan

@@ -6,9 +6,9 @@ import pytest
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from aeropend_ident.bag import Bag
-from aeropend_ident.recording import read
-from aeropend_ident.recover import main, recover
+from aeropend_ident.bags.bag import Bag
+from aeropend_ident.bags.recording import read
+from aeropend_ident.commands.recover import main, recover
 
 
 def messages(path):
@@ -135,7 +135,7 @@ def test_full_disk_leaves_nothing(broken, tmp_path, processes):
     path, _ = broken
     code = f"""
 import resource, sys
-from aeropend_ident.recover import main
+from aeropend_ident.commands.recover import main
 resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))  # what writes past it fails, as on a full disk
 sys.exit(main([{str(path)!r}]))
 """
@@ -149,7 +149,7 @@ def test_qos_is_kept(bags, tmp_path):
     """A bag of an unfinished recording, as `record` leaves it when it is killed."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
-    from aeropend_ident.writer import BagWriter
+    from aeropend_ident.bags.writer import BagWriter
 
     forever = QosTime(9223372036, 854775807)
     qos = Qos(

@@ -10,15 +10,15 @@ from functools import cache
 
 import numpy as np
 import pytest
-from rigs import BENCH, drawn_rig, steps
 
-from aeropend_ident import diagnose as command
-from aeropend_ident.gap.diagnosis import diagnose
-from aeropend_ident.gap.signals import from_arrays
-from aeropend_ident.recording import RecordingError
-from aeropend_sim import rig
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import SAMPLE_PERIOD
+from aeropend_ident.bags.recording import RecordingError
+from aeropend_ident.commands import diagnose as command
+from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.signals.signals import from_arrays
+from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
+from aeropend_sim.model import rig
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
 EFFECTS = {"none": {}, "coulomb_friction": {"coulomb_friction": {}}, "brush_drop": {"brush_drop": {}},
            "supply_sag": {"supply_sag": {}}}

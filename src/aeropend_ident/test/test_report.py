@@ -11,16 +11,17 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from blind import cases
-from rigs import BENCH, recorded
+from evaluation.blind import cases
 
-from aeropend_ident.diagnose import document
-from aeropend_ident.gap import curves, report, words
-from aeropend_ident.gap.diagnosis import diagnose
-from aeropend_ident.gap.signals import from_arrays
-from aeropend_ident.results import verdict_lines
-from aeropend_sim.effects import CATALOGUE, PLACES
-from aeropend_sim.parameters import SAMPLE_PERIOD
+from aeropend_ident.commands.diagnose import document
+from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.report import curves, number_format
+from aeropend_ident.diagnosis.report import page as report_page
+from aeropend_ident.diagnosis.results import verdict_lines
+from aeropend_ident.signals.signals import from_arrays
+from aeropend_ident.testing.rigs import BENCH, recorded
+from aeropend_sim.model.effects import CATALOGUE, PLACES
+from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
 VOID = {"area", "base", "br", "col", "embed", "hr", "img", "input", "link", "meta", "source", "track", "wbr"}
 HOSTILE = "</script><script>alert('1')</script>\"><img src=x onerror=alert(2)>{{ 7 * 7 }}"
@@ -72,7 +73,7 @@ class Page(HTMLParser):
 def rendered(diagnosis, bags=("my_bag",), model="bench", command="diagnose my_bag", **which):
     made = document(diagnosis, list(bags), model, 2.5)
     made["which"] = {**made["which"], **which}
-    return report.render(diagnosis, json.loads(json.dumps(made)), command)
+    return report_page.render(diagnosis, json.loads(json.dumps(made)), command)
 
 
 @pytest.fixture(scope="module")
@@ -181,10 +182,11 @@ def test_one_effect(friction):
     for place in PLACES:
         assert place in page.text("ol")
     body = friction.body
-    assert words.percent(body["where"]["share"]["arm"]).replace("\N{NO-BREAK SPACE}", " ") in page.text("ol")
+    assert number_format.percent(body["where"]["share"]["arm"]).replace("\N{NO-BREAK SPACE}", " ") in page.text("ol")
     for row in body["channels"].values():
         for key in ("gap", "gap_after", "floor"):
-            assert words.quantity(row[key], row["unit"]).replace("\N{NO-BREAK SPACE}", " ") in page.text("table")
+            said = number_format.quantity(row[key], row["unit"]).replace("\N{NO-BREAK SPACE}", " ")
+            assert said in page.text("table")
     for name in body["which"]["numbers"]:
         assert name in page.text("table")
 
@@ -311,7 +313,7 @@ def test_regions_are_marked_where_the_misfit_is_drawn(several, nominal):
     page = Page(rendered(several))
     marked = [a for a in page.all("rect") if a.get("class") == "range"]
     assert len(marked) == len(regions)
-    assert all(0.0 <= float(a["x"]) <= float(a["x"]) + float(a["width"]) <= report.WIDTH + 0.2 for a in marked)
+    assert all(0.0 <= float(a["x"]) <= float(a["x"]) + float(a["width"]) <= page.WIDTH + 0.2 for a in marked)
     said = [a["aria-label"] for a in page.all("svg") if a.get("aria-label", "").startswith("Misfit")]
     assert len(said) == 6
     assert sum("stands out" in text for text in said) == len(regions)
@@ -387,7 +389,7 @@ def test_a_number_that_moved_is_marked(friction):
     marked = [text for stack, text in page.texts if stack[-2:] == ("td", "span")]
     assert "+20\N{NO-BREAK SPACE}%" in marked
     off = [a for tag, a, stack in page.tags if a.get("class") == "off"]
-    assert len(off) == 1 + sum(abs(n["value"] / n["nominal"] - 1.0) > report.OFF
+    assert len(off) == 1 + sum(abs(n["value"] / n["nominal"] - 1.0) > page.OFF
                                for name, n in numbers.items() if name not in moved)
 
 
@@ -432,7 +434,7 @@ def test_a_long_recording_stays_small(friction):
     (-12345.6, "", "−12300"), (0.0, "A", "0.00 A"), (2.0, "-", "2.00"), (None, "A", "–"), (math.nan, "A", "–"),
 ])
 def test_quantities(value, unit, text):
-    assert words.quantity(value, unit).replace("\N{NO-BREAK SPACE}", " ") == text
+    assert number_format.quantity(value, unit).replace("\N{NO-BREAK SPACE}", " ") == text
 
 
 @pytest.mark.parametrize(("numbers", "texts"), [
@@ -444,7 +446,7 @@ def test_quantities(value, unit, text):
     ((1.0, math.nan, math.inf), ("1.00", "– to –")),
 ])
 def test_intervals(numbers, texts):
-    assert tuple(t.replace("\N{NO-BREAK SPACE}", " ") for t in words.interval(*numbers)) == texts
+    assert tuple(t.replace("\N{NO-BREAK SPACE}", " ") for t in number_format.interval(*numbers)) == texts
 
 
 @pytest.mark.parametrize(("share", "text"), [
@@ -452,28 +454,28 @@ def test_intervals(numbers, texts):
     (0.0, "0 %"), (-0.2, "−20 %"), (None, "–"),
 ])
 def test_percents(share, text):
-    assert words.percent(share).replace("\N{NO-BREAK SPACE}", " ") == text
+    assert number_format.percent(share).replace("\N{NO-BREAK SPACE}", " ") == text
 
 
 def test_no_probability_is_certain():
-    assert words.probability(1.0).startswith(">")
-    assert words.probability(0.0).startswith("<")
+    assert number_format.probability(1.0).startswith(">")
+    assert number_format.probability(0.0).startswith("<")
 
 
 def test_every_stretch_keeps_its_least_and_greatest():
     x = np.random.default_rng(1).standard_normal(10_007)
     x[[500, 5000]] = 99.0, -99.0
     x[2000:3000] = np.nan
-    drawn = report._least_and_greatest(x, 400)
+    drawn = report_page._least_and_greatest(x, 400)
     assert len(drawn) == 400
     assert (np.nanmax(drawn), np.nanmin(drawn)) == (99.0, -99.0)
     assert 30 <= np.isnan(drawn).sum() <= 40
-    assert report._least_and_greatest(x, 20_000) is x
+    assert report_page._least_and_greatest(x, 20_000) is x
 
 
 def test_packed_values_come_back():
     x = np.concatenate([np.linspace(-3.0, 5.0, 1001), [np.nan]])
-    packed = report._packed(x)
+    packed = report_page._packed(x)
     steps = np.frombuffer(base64.b64decode(packed["data"]), "<i2").astype(float)
     back = np.where(steps == -32768, np.nan, packed["low"] + (steps + 32767) * packed["scale"])
     assert np.nanmax(np.abs(back - x)) <= 8.0 / 65534 / 2 * 1.001
@@ -482,4 +484,5 @@ def test_packed_values_come_back():
 
 
 def test_a_path_has_gaps_where_values_are_missing():
-    assert report._path(np.array([0.0, 1.0, np.nan, 1.0, 0.0]), 0.0, 1.0) == "M0 400l0 0 400-400M1200 0l0 0 400 400"
+    drawn = report_page._path(np.array([0.0, 1.0, np.nan, 1.0, 0.0]), 0.0, 1.0)
+    assert drawn == "M0 400l0 0 400-400M1200 0l0 0 400 400"

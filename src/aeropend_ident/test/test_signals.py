@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
-from rigs import BENCH, drawn_rig, recorded, steps
 
-from aeropend_ident.gap.signals import find_pulses, from_arrays
-from aeropend_ident.recording import RecordingError
-from aeropend_sim import rig
-from aeropend_sim.parameters import SAMPLE_PERIOD
+from aeropend_ident.bags.recording import RecordingError
+from aeropend_ident.signals.signals import find_pulses, from_arrays
+from aeropend_ident.testing.rigs import BENCH, drawn_rig, recorded, steps
+from aeropend_sim.model import rig
+from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
 
 def columns(duration=6.0, **replaced):

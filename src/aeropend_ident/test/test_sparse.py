@@ -5,18 +5,18 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from aeropend_ident import lorenz
-from aeropend_ident.dataset import from_arrays
-from aeropend_ident.discrepancy import nominal
-from aeropend_ident.identify import Problem, document, identify, lines
-from aeropend_ident.output_error import Entries, Fitter
-from aeropend_ident.recording import RecordingError
-from aeropend_ident.refine import Linear
-from aeropend_ident.sparse import Sums, select
-from aeropend_ident.terms import thesis_terms
-from aeropend_sim import actuator, dynamics
-from aeropend_sim.excitation import Excitation
-from aeropend_sim.parameters import SAMPLE_PERIOD, Model, ModelError, load
+from aeropend_ident.bags.recording import RecordingError
+from aeropend_ident.identification.dataset import from_arrays
+from aeropend_ident.identification.discrepancy import nominal
+from aeropend_ident.identification.identify import Problem, document, identify, lines
+from aeropend_ident.identification.output_error import Entries, Fitter
+from aeropend_ident.identification.output_error_selection import Linear
+from aeropend_ident.identification.subset_selection import Sums, select
+from aeropend_ident.identification.terms import thesis_terms
+from aeropend_ident.studies import lorenz
+from aeropend_sim.model import actuator, dynamics
+from aeropend_sim.model.excitation import Excitation
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, ModelError, load
 
 STATES = ("theta", "theta_dot", "i_a", "omega")
 THESIS = load("thesis")

@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from aeropend_ident.terms import Library, TermError, polynomials, terms_at, thesis_terms
+from aeropend_ident.identification.terms import Library, TermError, polynomials, terms_at, thesis_terms
 
 VARIABLES = ("theta", "theta_dot", "i_a", "omega", "v_a")
 

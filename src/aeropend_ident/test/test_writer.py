@@ -13,9 +13,9 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
 
-from aeropend_ident.bag import Bag
-from aeropend_ident.recording import read
-from aeropend_ident.writer import BagWriter
+from aeropend_ident.bags.bag import Bag
+from aeropend_ident.bags.recording import read
+from aeropend_ident.bags.writer import BagWriter
 
 UNFINISHED = "the recording was not closed (killed, or still running): it may end up to a second early"
 
@@ -179,8 +179,8 @@ def test_killed_in_the_middle_of_a_checkpoint(bags, tmp_path, stop):
 FILL = """
 import resource, sys
 from pathlib import Path
-from aeropend_ident.bag import Bag
-from aeropend_ident.writer import BagWriter
+from aeropend_ident.bags.bag import Bag
+from aeropend_ident.bags.writer import BagWriter
 from rosbags.typesys import Stores, get_typestore
 store = get_typestore(Stores.ROS2_JAZZY)
 source, target, storage, limit = *map(Path, sys.argv[1:3]), sys.argv[3], int(sys.argv[4])

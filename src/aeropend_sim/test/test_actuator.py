@@ -6,8 +6,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from aeropend_sim import actuator
-from aeropend_sim.parameters import PRESETS, SAMPLE_PERIOD, load
+from aeropend_sim.model import actuator
+from aeropend_sim.model.parameters import PRESETS, SAMPLE_PERIOD, load
 
 BENCH, THESIS = (load(preset).model for preset in ("bench", "thesis"))
 presets = st.sampled_from([BENCH, THESIS])

@@ -6,8 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from aeropend_sim import bench_fit
-from aeropend_sim.parameters import load
+from aeropend_sim.model.parameters import load
+from aeropend_sim.studies import bench_fit
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,7 @@ def test_no_choice_of_the_numbers_meets_rise_and_peak_time():
 
 
 def test_command_prints_the_table_and_saves_a_picture(tmp_path):
-    command = [sys.executable, "-m", "aeropend_sim.bench_fit"]
+    command = [sys.executable, "-m", "aeropend_sim.studies.bench_fit"]
     picture = tmp_path / "step.png"
     try:
         import matplotlib  # noqa: F401

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import pytest
 
-from aeropend_sim.command import Parser, between
+from aeropend_sim.cli.command import Parser, between
 
 
 @pytest.fixture

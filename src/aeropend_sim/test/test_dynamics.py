@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from aeropend_sim import actuator, dynamics
-from aeropend_sim.dynamics import simulate, squared_errors, steady, steps_in
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import SAMPLE_PERIOD, Model, load
+from aeropend_sim.model import actuator, dynamics
+from aeropend_sim.model.dynamics import simulate, squared_errors, steady, steps_in
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
 
 PERIODS = [5e-4, SAMPLE_PERIOD, 5e-3, 20e-3, 50e-3]
 EQUATIONS = [id_ for id_, effect in CATALOGUE.items() if effect.place != "sensing"]

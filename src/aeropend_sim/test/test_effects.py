@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aeropend_sim.dynamics import Trajectory
-from aeropend_sim.effects import CATALOGUE, PARAMETER_MISMATCH, PLACES, is_active, values
-from aeropend_sim.parameters import MODEL_NAMES, SAMPLE_PERIOD, Model, load
-from aeropend_sim.rig import Sample, record
+from aeropend_sim.model.dynamics import Trajectory
+from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH, PLACES, is_active, values
+from aeropend_sim.model.parameters import MODEL_NAMES, SAMPLE_PERIOD, Model, load
+from aeropend_sim.model.rig import Sample, record
 
 CONTRACT = {
     "bridge_drop": ("actuator", "v_drop V"), "supply_sag": ("actuator", "r_supply Ω"),

@@ -4,9 +4,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from aeropend_sim.dynamics import simulate
-from aeropend_sim.excitation import KINDS, Excitation
-from aeropend_sim.parameters import SAMPLE_PERIOD, load
+from aeropend_sim.model.dynamics import simulate
+from aeropend_sim.model.excitation import KINDS, Excitation
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, load
 
 
 def holds(series):

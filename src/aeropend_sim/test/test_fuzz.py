@@ -12,8 +12,8 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aeropend_sim.parameters import PARAMETERS, SECTIONS, Model, ModelError, load, save
-from aeropend_sim.ros import UserError, _readable_parameter_files
+from aeropend_sim.model.parameters import PARAMETERS, SECTIONS, Model, ModelError, load, save
+from aeropend_sim.ros.program import UserError, _readable_parameter_files
 from aeropend_sim.untrusted import LONGEST_MESSAGE, check_yaml, printable
 
 FUZZ = int(os.environ.get("FUZZ", "1"))
@@ -118,7 +118,7 @@ def test_what_grows_is_refused_before_it_does(bomb):
 def test_no_tag_runs_code(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for tag in ("object/apply:os.system [touch pwned]", "object/new:os.system [touch pwned]", "name:os.system ''",
-                "module:antigravity ''", "object:aeropend_sim.parameters.Model {}"):
+                "module:antigravity ''", "object:aeropend_sim.model.parameters.Model {}"):
         with pytest.raises(yaml.YAMLError):
             yaml.load(f"!!python/{tag}", yaml.SafeLoader)
         read(b"/**:\n  ros__parameters:\n    model: !!python/" + tag.encode())

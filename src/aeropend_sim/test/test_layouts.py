@@ -9,7 +9,7 @@ from importlib.resources import files
 import pytest
 from std_msgs.msg import Float64
 
-from aeropend_sim import interface
+from aeropend_sim.ros import interface
 
 LAYOUTS = files("aeropend_sim").joinpath("layouts")
 MESSAGES = {

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import (
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import (
     MODEL_NAMES,
     PARAMETERS,
     PRESETS,

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from aeropend_sim import interface
-from aeropend_sim.parameters import load
-from aeropend_sim.pose import PAUSE_S, Rotor
+from aeropend_sim.model.parameters import load
+from aeropend_sim.nodes.pose import PAUSE_S, Rotor
+from aeropend_sim.ros import interface
 
 URDF = files("aeropend_sim").joinpath("urdf/aeropendulum.urdf")
 ROBOT = ET.fromstring(URDF.read_text(encoding="utf-8"))

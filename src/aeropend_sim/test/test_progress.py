@@ -5,7 +5,7 @@ import time
 from rich.console import Console
 from rich.progress import Progress
 
-from aeropend_sim.progress import TimeLeft, progress
+from aeropend_sim.cli.progress import TimeLeft, progress
 
 
 def shown(silent_s, *, terminal):

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aeropend_sim import dynamics
-from aeropend_sim.effects import CATALOGUE
-from aeropend_sim.parameters import SAMPLE_PERIOD, load
-from aeropend_sim.rig import Rig, Sample, Truth, record
+from aeropend_sim.model import dynamics
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, load
+from aeropend_sim.model.rig import Rig, Sample, Truth, record
 
 ALL = {id_: {name: p.default for name, p in effect.parameters.items()} for id_, effect in CATALOGUE.items()}
 MODELS = {

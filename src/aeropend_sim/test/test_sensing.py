@@ -9,11 +9,11 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import brentq
 
-from aeropend_sim import sensing
-from aeropend_sim.dynamics import simulate
-from aeropend_sim.effects import SPIKE_FACTOR
-from aeropend_sim.parameters import SAMPLE_PERIOD, Model, load
-from aeropend_sim.rig import record
+from aeropend_sim.model import sensing
+from aeropend_sim.model.dynamics import simulate
+from aeropend_sim.model.effects import SPIKE_FACTOR
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
+from aeropend_sim.model.rig import record
 
 H = SAMPLE_PERIOD
 STEP = 2.0 * math.pi

@@ -6,9 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from aeropend_sim import actuator, bench_fit
-from aeropend_sim.dynamics import simulate
-from aeropend_sim.parameters import SAMPLE_PERIOD, load
+from aeropend_sim.model import actuator
+from aeropend_sim.model.dynamics import simulate
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, load
+from aeropend_sim.studies import bench_fit
 
 # blocked rotor: v_a in V, i_a in A
 TABLE_4_1 = np.array([

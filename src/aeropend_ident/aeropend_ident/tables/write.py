@@ -16,10 +16,10 @@ from rosbags.rosbag2.errors import WriterError
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from aeropend_ident.cdr import encode
+from aeropend_ident.bags.cdr import encode
+from aeropend_ident.bags.writer import BagWriter
 from aeropend_ident.tables.mapping import Samples
 from aeropend_ident.tables.table import Floats, Ints
-from aeropend_ident.writer import BagWriter
 
 JOINT, BATTERY, FLOAT = "sensor_msgs/msg/JointState", "sensor_msgs/msg/BatteryState", "std_msgs/msg/Float64"
 

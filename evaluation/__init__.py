@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What measures: verdicts on withheld effects, benchmarks, endurance, comparisons."""

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The blind check: recordings of withheld effects are made, diagnosed, and only then compared with their labels.
+
+    make blind                            312 recordings of 70 s: about an hour on two cores, 2.5 GB
+    make blind ARGS="--count 60 --seed 7"
+    make blind ARGS="--unknown --count 120"      rigs whose numbers nobody knows
+
+Steps can be run alone: --steps make,diagnose,peers,score. The labels stay sealed until every verdict is written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import time
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from joblib import Parallel, delayed
+from rich.progress import Progress
+
+from aeropend_ident.bags import recording
+from aeropend_ident.commands.diagnose import document
+from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.signals.signals import from_recording
+from aeropend_ident.testing import bags
+from aeropend_sim.model.parameters import load
+from evaluation.blind import cases, limit, peers, plant, report, uncalibrated
+
+MODEL = "bench"
+SEALED = "labels.sealed"
+SPARSE, BIC = "sparse regression of the discrepancy (pysindy)", "stepwise BIC on output error"
+SHARES = {"single": 0.54, "none": 0.18, "two": 0.14, "outside": 0.14}
+
+
+def plan(count: int, seed: int) -> list[tuple[str, list[str], str, bool]]:
+    """Kind, effects, form and whether the loop is closed, of each recording; every effect as often as any other."""
+    rng = np.random.default_rng([seed, 1])
+    inside, outside = [*plant.EFFECTS, "parameter_mismatch"], list(plant.OUTSIDE)
+    singles = round(SHARES["single"] * count)
+    rows: list[tuple[str, list[str], str, bool]] = []
+    order = [e for _ in range(singles // len(inside) + 1) for e in rng.permutation(inside)]
+    rows += [("single", [str(e)], str(rng.choice(["table", "other"])), bool(rng.random() < 0.1))
+             for e in order[:singles]]
+    rows += [("none", [], "table", bool(rng.random() < 0.1)) for _ in range(round(SHARES["none"] * count))]
+    rows += [("two", [str(e) for e in rng.choice(list(plant.EFFECTS), 2, replace=False)],
+              str(rng.choice(["table", "other"])), False) for _ in range(round(SHARES["two"] * count))]
+    order = [e for _ in range(count // len(outside) + 1) for e in rng.permutation(outside)]
+    rows += [("outside", [str(e)], "table", False) for e in order[: round(SHARES["outside"] * count)]]
+    return [rows[k] for k in rng.permutation(len(rows))]
+
+
+def make(out: Path, count: int, seed: int, duration: float, jobs: int) -> None:
+    """Make the recordings, and seal their labels."""
+    nominal = load(MODEL)
+
+    def one(k: int, row: tuple[str, list[str], str, bool]) -> dict[str, object]:
+        kind, effects, form, closed = row
+        case, columns = cases.draw(f"r{k:03d}", kind, effects, form, nominal.model, nominal.sensing,
+                                   seed * 100_003 + k, duration, closed_loop=closed)
+        bags.write(out / "recordings" / case.name, columns, round(plant.PERIOD * 1e9))
+        return case.label()
+
+    (out / "recordings").mkdir(parents=True)
+    rows = plan(count, seed)
+    labels = list(_shown("making recordings", rows, one, jobs))
+    (out / SEALED).write_bytes(zlib.compress(json.dumps(labels).encode()))
+
+
+def diagnose_all(out: Path, jobs: int, only: list[str]) -> None:
+    """Write a verdict for each recording; the labels stay sealed."""
+    model = load(MODEL)
+    (out / "verdicts").mkdir(exist_ok=True)
+
+    def one(_: int, name: str) -> None:
+        started = time.perf_counter()
+        path = out / "recordings" / name
+        try:
+            result = diagnose(model, [from_recording(recording.read(str(path)), model.sensing)], 1)
+            body = document(result, [name], MODEL, time.perf_counter() - started)
+        except recording.RecordingError as error:
+            body = {"error": str(error), "seconds": time.perf_counter() - started}
+        (out / "verdicts" / f"{name}.json").write_text(json.dumps(body))
+
+    names = sorted(p.name for p in (out / "recordings").iterdir())
+    for _ in _shown("diagnosing", [n for n in names if not only or n in only], one, jobs):
+        pass
+
+
+def ask_peers(out: Path, jobs: int, every: int) -> None:
+    """Write what two peers say: sparse regression of every recording, stepwise BIC of one in `every`: it is slow."""
+    model = load(MODEL)
+
+    def one(_: int, row: tuple[str, str]) -> tuple[str, str, dict[str, Any]]:
+        peer, name = row
+        signals = from_recording(recording.read(str(out / "recordings" / name)), model.sensing)
+        answer = peers.sparse_regression if peer == SPARSE else peers.stepwise_bic
+        return peer, name, answer(signals, model)
+
+    names = sorted(p.name for p in (out / "recordings").iterdir())
+    rows = [(SPARSE, n) for n in names] + [(BIC, n) for n in names[::every]]
+    answers: dict[str, dict[str, Any]] = {SPARSE: {}, BIC: {}}
+    for peer, name, answer in _shown("asking peers", rows, one, jobs):
+        answers[peer][name] = answer
+    (out / "peers.json").write_text(json.dumps(answers))
+
+
+def limits(out: Path, labels: list[dict[str, Any]], jobs: int) -> dict[str, Any]:
+    """What a likelihood test that knows both hypotheses would reach, for the single effects of the table's form."""
+    model = load(MODEL)
+
+    def one(_: int, label: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+        signals = from_recording(recording.read(str(out / "recordings" / label["name"])), model.sensing)
+        effect = label["effects"][0]
+        return label["name"], limit.limit(label["numbers"], {effect["effect"]: effect["parameters"]}, signals.duty,
+                                          signals.sigma)
+
+    rows = [c for c in labels if c["kind"] == "single" and c["form"] == "table" and not c["closed_loop"]
+            and c["effects"][0]["effect"] not in limit.RANDOM]
+    return dict(_shown("finding the limit", rows, one, jobs))
+
+
+def _shown(what: str, rows: list[Any], one: Any, jobs: int) -> list[Any]:
+    """Run one(k, row) for each row on `jobs` processes, with a bar."""
+    with Progress() as bar:
+        return list(bar.track(Parallel(jobs, return_as="generator")(delayed(one)(k, r) for k, r in enumerate(rows)),
+                              len(rows), description=what))
+
+
+def opened(out: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
+    """Labels and verdicts.
+
+    Raises:
+        SystemExit: a verdict is missing; the labels stay sealed until all are written.
+    """
+    names = sorted(p.name for p in (out / "recordings").iterdir())
+    missing = [n for n in names if not (out / "verdicts" / f"{n}.json").exists()]
+    if missing:
+        raise SystemExit(f"{len(missing)} of {len(names)} verdicts are missing ({missing[0]} ...): diagnose first")
+    verdicts = {n: json.loads((out / "verdicts" / f"{n}.json").read_text()) for n in names}
+    return json.loads(zlib.decompress((out / SEALED).read_bytes())), verdicts
+
+
+def _of_unknown_rigs(options: argparse.Namespace, steps: list[str]) -> None:
+    out = options.out / "unknown"
+    if "make" in steps:
+        shutil.rmtree(out, ignore_errors=True)
+        uncalibrated.make(out, options.count, options.seed, options.duration, options.jobs)
+    if "diagnose" in steps:
+        uncalibrated.diagnose_all(out, options.jobs)
+    if "score" in steps:
+        uncalibrated.report(out)
+
+
+def main() -> None:
+    """Run the steps asked for."""
+    parser = argparse.ArgumentParser(prog="blind", description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--count", type=int, default=312, help="recordings (default 312)")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--duration", type=float, default=70.0, help="s of each recording (default 70)")
+    parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
+    parser.add_argument("--out", type=Path, default=Path("blind-results"))
+    parser.add_argument("--steps", default="make,diagnose,peers,score")
+    parser.add_argument("--bic-every", type=int, default=4, help="ask stepwise BIC for one recording in so many")
+    parser.add_argument("--only", nargs="*", default=[], help="diagnose only these recordings")
+    parser.add_argument("--unknown", action="store_true",
+                        help="rigs whose numbers nobody knows: angle and command alone, and free decays")
+    options = parser.parse_args()
+    steps = options.steps.split(",")
+    if options.unknown:
+        _of_unknown_rigs(options, steps)
+        return
+    if "make" in steps:
+        shutil.rmtree(options.out, ignore_errors=True)
+        make(options.out, options.count, options.seed, options.duration, options.jobs)
+    if "diagnose" in steps:
+        diagnose_all(options.out, options.jobs, options.only)
+    if "peers" in steps:
+        ask_peers(options.out, options.jobs, options.bic_every)
+    if "score" in steps:
+        labels, verdicts = opened(options.out)
+        asked = options.out / "peers.json"
+        answers = json.loads(asked.read_text()) if asked.exists() else {}
+        known = limits(options.out, labels, options.jobs) if answers else None
+        report.report(labels, verdicts, answers, options.out, known)
+
+
+if __name__ == "__main__":
+    main()

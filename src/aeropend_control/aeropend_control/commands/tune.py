@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gains of a law from requirements and a model file, with the margins and the step responses that they give."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Mapping, Sequence
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from aeropend_control.analysis import closed_loop
+from aeropend_control.analysis.margins import MarginError, Margins, margins
+from aeropend_control.analysis.step_response import StepError, StepResponse, step_responses
+from aeropend_control.laws.registry import LAWS, GainError, LawKind, Requirements, TuningError
+from aeropend_sim.cli.command import EXIT_CODES, Parser, interruptible
+from aeropend_sim.cli.progress import Show, nothing, progress
+from aeropend_sim.model.parameters import Model, ModelError, load
+
+LEVELS = {"theta": (0.2, 0.4, 0.7), "omega": (60.0, 99.5, 140.0)}
+"""Steps from rest that are predicted, and operating points whose margins are shown: rad, rad/s."""
+
+HOLD = 5.0
+"""s for which a step is predicted."""
+
+EXAMPLES = f"""examples:
+  tune feedback_linearization
+  tune small_signal --model verdict/augmented.yaml --t-s 2
+  tune cascade --gains thesis
+
+{EXIT_CODES}"""
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Read the command line; exits with 2 and one line where it is wrong."""
+    parser = Parser(prog="tune", description=__doc__, epilog=EXAMPLES,
+                    formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("law", choices=list(LAWS), metavar="LAW", help=f"one of {', '.join(LAWS)}")
+    parser.add_argument("--model", default="bench", metavar="PRESET|FILE",
+                        help="preset (bench, thesis) or model file (default: bench)")
+    parser.add_argument("--gains", metavar="PRESET", help="show these instead of tuning: thesis")
+    for name, unit in (("t_r", "s"), ("t_p", "s"), ("t_s", "s"), ("M_p", "share")):
+        parser.add_argument("--" + name.lower().replace("_", "-"), dest=name, type=float, metavar=unit.upper(),
+                            help=f"{name} at most, {unit} (default: the thesis' requirement)")
+    return parser.parse_args(arguments)
+
+
+def chosen_gains(kind: LawKind, model: Model, options: argparse.Namespace) -> dict[str, float]:
+    """Gains as the command line asks for.
+
+    Raises:
+        GainError: no such preset. TuningError: requirements that cannot be met.
+    """
+    if options.gains is not None:
+        if options.gains not in kind.presets:
+            raise GainError(f"no gains '{options.gains}'; give one of {', '.join(kind.presets)}")
+        return dict(kind.presets[options.gains])
+    given = {name: getattr(options, name) for name in Requirements._fields if getattr(options, name) is not None}
+    return kind.tune(model, kind.requirements._replace(**given))
+
+
+def gains_table(kind: LawKind, gains: Mapping[str, float]) -> Table:
+    """One row a gain."""
+    out = Table(box=box.SIMPLE)
+    for name in ("gain", "value", "unit", "meaning"):
+        out.add_column(name, justify="right" if name == "value" else "left")
+    for name, gain in kind.parameters.items():
+        out.add_row(name, f"{gains[name]:.5g}", gain.unit, gain.description)
+    return out
+
+
+def answers_table(law: str, model: Model, gains: Mapping[str, float], show: Show = nothing) -> Table:
+    """One row a level: the predicted answer to a step from rest, and the margins there."""
+    kind = LAWS[law]
+    out = Table(box=box.SIMPLE)
+    headings = (f"step to / {kind.reference_unit}", "t_r / s", "t_p / s", "t_s / s", "M_p / %", "gain margin",
+                "phase margin / °", "delay margin / ms", "crossover / rad/s")
+    for heading in headings:
+        out.add_column(heading, justify="right")
+    levels = LEVELS[kind.measures]
+    for number, level in enumerate(levels):
+        show(number / len(levels))
+        out.add_row(f"{level:g}", *_answer(kind, model, gains, level), *_margins(law, model, gains, level))
+    return out
+
+
+def _answer(kind: LawKind, model: Model, gains: Mapping[str, float], level: float) -> list[str]:
+    run = closed_loop.predict(kind.make(model, gains), model, closed_loop.staircase([level], HOLD))
+    try:
+        s: StepResponse = step_responses(run.time, run.truth[kind.measures], run.reference,
+                                         0.06 if kind.measures == "theta" else 0.0)[0]
+    except StepError:
+        return ["-"] * 4
+    return [_number(s.rise_time, 3), _number(s.peak_time, 3), _number(s.settling_time, 2), f"{100.0 * s.overshoot:.1f}"]
+
+
+def _margins(law: str, model: Model, gains: Mapping[str, float], level: float) -> list[str]:
+    try:
+        m: Margins = margins(model, law, gains, level)
+    except MarginError:
+        return ["does not rest", "-", "-", "-"]
+    return [_number(m.gain, 2), _number(math.degrees(m.phase), 0), _number(1e3 * m.delay, 0), _number(m.crossover, 1)]
+
+
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else "-" if math.isnan(value) else "any"
+
+
+@interruptible
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command; returns its exit code."""
+    options = parse(arguments)
+    kind = LAWS[options.law]
+    try:
+        model = load(options.model)
+        gains = chosen_gains(kind, model, options)
+    except (ModelError, GainError, TuningError) as error:
+        print(f"tune: {error}", file=sys.stderr)
+        return 2
+    console = Console(width=130)
+    console.print(f"{options.law} on {model.name}: {kind.summary}")
+    console.print(gains_table(kind, gains))
+    with progress("what these gains give") as show:
+        answers = answers_table(options.law, model, gains, show)
+    console.print(answers)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The model, run beside the rig and corrected by its readings: what the laws know of the rig's state."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.linalg import expm, solve_discrete_are
+
+from aeropend_sim.model import actuator, dynamics, sensing
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+
+Array = NDArray[np.float64]
+
+DISTURBANCE = 2.0
+"""rad/s² per √s: how fast the observer expects unknown torque to wander. More: quicker, and more noise in the rate."""
+
+SPEED_TIME = 0.25
+"""s over which the speed of the rotor is corrected by its reading."""
+
+CURRENT_TIME = 0.05
+"""s over which the current is corrected by its reading."""
+
+OUTLIER = (0.2, 5.0)
+"""A speed further off than this share and this much (rad/s) is believed only with the third such reading."""
+
+LEAST_NOISE = 1e-4
+"""rad: readings are never trusted more than this, since no model is exact."""
+
+
+class Estimate(NamedTuple):
+    """What the observer says of an instant.
+
+    Attributes:
+        state: SI.
+        drive: what `dynamics.arm_drive` holds beside the thrust, rad/s²; dry friction, the observer's own estimate of
+            unknown torque and the mast are not in it. (A mast that swings is as good as rigid for slow motion, and
+            thrust is too late to take back what it does in quick motion: the observer alone knows of it.)
+        nominal_drive: the same without effects.
+        ground: share by which the ground effect raises the thrust.
+    """
+
+    state: dynamics.State
+    drive: float
+    nominal_drive: float
+    ground: float
+
+
+class _Motor(NamedTuple):
+    """Names of what the observer keeps of the motor, in an array."""
+
+    voltage: int = 0
+    current: int = 1
+    read: int = 2
+    at_pulse: int = 3
+    outliers: int = 4
+    samples: int = 5
+
+
+MOTOR = _Motor()
+
+HISTORY = 512
+"""Samples for which the angle of the rotor is kept: longer than the longest time between pulses that is read."""
+
+
+def parameter(model: Model, effect: str, name: str) -> float:
+    """A number of an effect; neutral where the model does not name the effect."""
+    return model.effects.get(effect, {}).get(name, CATALOGUE[effect].parameters[name].neutral)
+
+
+class Observer:
+    """The model, run beside the rig and corrected by each reading of the angle, and if asked of the motor.
+
+    Torque that it does not know appears as its `gust`. The gains are those of the stationary Kalman filter of the arm
+    and the angle filter for the reading's noise and quantisation.
+
+    The speed that is read is the mean over the last interval between pulses, late and held. It is compared with the
+    mean of the model's speed over that same interval, once; the difference corrects the speed and a voltage that
+    stands for what the model does not know of the motor. The difference of the currents is smoothed and added.
+    """
+
+    def __init__(self, model: Model, period: float = SAMPLE_PERIOD, motor: bool = False) -> None:
+        """Take the model file's model; `motor`: whether speed and current are read too."""
+        self.model, self.period, self.motor = model, period, motor
+        self.numbers = model.numbers()
+        steady = {"gust": {"sigma": 1e-9, "tau": 1e3}}  # never drawn: it holds the estimate, and all but keeps it
+        c, e, x = dynamics.prepare(model.with_effects({**model.effects, **steady}), period)
+        assert e is not None
+        assert x is not None
+        self.plant = c, e, x
+        self._chain = sensing.prepare(model, period)
+        self._gain = _kalman(self._chain, self.numbers["c_over_J"], period)
+        n = self.numbers
+        self._per_volt = n["K_t"] / (n["R_a"] * n["B_m"] + n["K_e"] * n["K_t"])  # rad/s, without load
+        delay = parameter(model, "command_delay", "delay") / period
+        self._whole = math.floor(delay + 1e-9)
+        self._effects = dict(model.effects)
+        if delay > 0.0:  # whole periods of it are the queue's
+            self._effects["command_delay"] = {"delay": max(delay - self._whole, 0.0) * period}
+        self.reset()
+
+    def reset(self, duty: float = 0.0, theta: float = math.nan) -> None:
+        """Start anew, at rest, from an angle (rad as read) or else the next; `duty` has been applied since long."""
+        self.count = 0
+        self._memory = sensing.NOTHING_READ
+        self._duty = duty
+        self._known = np.zeros(len(MOTOR))
+        self._angles = np.zeros(HISTORY)
+        self._queue = deque([self._voltage(duty)] * self._whole)
+        self.state: dynamics.State | None = None if math.isnan(theta) else self._start(theta)
+
+    @property
+    def voltage_bias(self) -> float:
+        """V that the motor seems to get beside what the model says."""
+        return float(self._known[MOTOR.voltage])
+
+    @property
+    def current_bias(self) -> float:
+        """A that the motor seems to draw beside what the model says."""
+        return float(self._known[MOTOR.current])
+
+    def step(self, theta: float, duty: float, omega: float = math.nan, i_a: float = math.nan) -> Estimate:
+        """Take a reading, with the duty that is applied from it on.
+
+        Args:
+            theta: rad as read; NaN where there is none. duty: 0..1.
+            omega: rad/s as read, and i_a, A; used only if the observer reads the motor.
+
+        Returns:
+            The estimate for the next sample, or for when a duty given then begins to act, if that is later.
+        """
+        if self.state is None:
+            self.state = self._start(theta)
+        self._queue.append(self._voltage(duty))
+        volts = np.array(self._queue)
+        self._queue.popleft()
+        self.count += 1
+        if self.motor:
+            self.state = _correct_motor(omega, i_a, self.state, self._known, self._angles, self._chain, self._per_volt)
+            volts = np.maximum(volts + self._known[MOTOR.voltage], 0.0)
+        self.state, self._memory, estimate = _observe(theta, volts, self.state, self._memory, self._gain, self._chain,
+                                                      *self.plant)
+        return Estimate(*estimate)
+
+    def _start(self, theta: float) -> dynamics.State:
+        angle = 0.0 if math.isnan(theta) else theta
+        for _ in range(8):  # the encoder's error depends on the angle a little
+            self._memory = sensing.start(angle, 0.0, 0.0, 0.0, self._chain)
+            angle += 0.0 if math.isnan(theta) else theta - self._memory.stage2
+        return dynamics.steady(self.model, self._duty)._replace(theta=angle)
+
+    def _voltage(self, duty: float) -> float:
+        """Voltage that acts over the hold in which this duty begins to act, but for the sag."""
+        held, self._duty = np.array([self._duty, duty]), duty
+        start = self.count + self._whole - 1
+        return float(actuator.acting_voltage(self.numbers, held, self._effects, self.period, start, held[0])[1])
+
+
+@njit(cache=True, nogil=True)
+def _observe(theta: float, volts: Array, s: dynamics.State, m: sensing.Memory, gain: Array, chain: sensing.Chain,
+             c: dynamics.Coefficients, e: object, x: object
+             ) -> tuple[dynamics.State, sensing.Memory, tuple[dynamics.State, float, float, float]]:
+    """Correct by a reading, advance over the first of the voltages, and predict over the others."""
+    if not math.isnan(theta):
+        error = theta - m.stage2
+        y, rate = s.theta + gain[0] * error, s.theta_dot + gain[1] * error
+        s = dynamics.State(s.i_a, s.omega, s.rotor_angle, y, rate, s.thrust, s.heat, s.flex, s.flex_dot,
+                           s.gust + gain[2] * error)
+        m = sensing.Memory(m.stage1 + gain[3] * error, m.stage2 + gain[4] * error, y, rate, m.omega, m.rotor_angle,
+                           m.last_pulse, m.speed, m.time)
+    scratch, silent = np.empty((7, len(volts))), np.zeros(len(volts))
+    s = dynamics.run(volts[:1], silent, s, c, e, x, scratch)
+    stage1, stage2 = sensing.filter_angle(m, s.theta, s.theta_dot, chain)
+    m = sensing.Memory(stage1, stage2, s.theta, s.theta_dot, m.omega, m.rotor_angle, m.last_pulse, m.speed, m.time)
+    p = dynamics.run(volts[1:], silent, s, c, e, x, scratch) if len(volts) > 1 else s
+    sine = math.sin(p.theta)
+    drive = dynamics.arm_drive(sine, p.theta, p.theta_dot, 0.0, p.omega, 0.0, 0.0, 0.0, c, e)
+    nominal = dynamics.arm_drive(sine, p.theta, p.theta_dot, 0.0, p.omega, 0.0, 0.0, 0.0, c, None)
+    return s, m, (p, drive, nominal, dynamics.near_ground(p.theta, e))
+
+
+@njit(cache=True, nogil=True)
+def _correct_motor(omega: float, i_a: float, s: dynamics.State, known: Array, angles: Array, chain: sensing.Chain,
+                   per_volt: float) -> dynamics.State:
+    """The state after the readings of speed and current; `known` and `angles` (a ring of samples) are updated."""
+    k = int(known[MOTOR.samples])
+    known[MOTOR.samples] += 1.0
+    angles[k % HISTORY] = s.rotor_angle
+    if not math.isnan(i_a):
+        more = (i_a - chain.current_bias) / chain.current_factor - s.i_a
+        known[MOTOR.current] += (more - known[MOTOR.current]) * -math.expm1(-chain.h / CURRENT_TIME)
+    if math.isnan(omega):
+        return s
+    time, error = chain.h, omega - s.omega
+    if chain.pulses > 0.0:
+        turn = 2.0 * math.pi / chain.pulses
+        if omega == 0.0:
+            if s.rotor_angle - known[MOTOR.at_pulse] < 3.0 * turn:
+                return s  # too early for a reading
+        else:
+            if omega == known[MOTOR.read]:
+                return s  # held, and used already
+            known[MOTOR.read], known[MOTOR.at_pulse] = omega, s.rotor_angle
+            time = turn / omega
+            first = k - 0.5 - time / chain.h  # the pulse came, on average, half a period ago
+            if first < 0.0 or time / chain.h > HISTORY - 2:
+                return s
+            error = omega - (_at(angles, k - 0.5) - _at(angles, first)) / time
+    limit = OUTLIER[0] * s.omega + OUTLIER[1]
+    if abs(error) > limit:
+        known[MOTOR.outliers] += 1.0
+        if known[MOTOR.outliers] < 3.0:
+            return s
+        error = math.copysign(limit, error)
+    else:
+        known[MOTOR.outliers] = 0.0
+    share = -math.expm1(-time / SPEED_TIME)
+    known[MOTOR.voltage] += share * error / per_volt
+    known[MOTOR.voltage] = min(max(known[MOTOR.voltage], -1.0), 1.0)
+    return dynamics.State(s.i_a, max(s.omega + share * error, 0.0), s.rotor_angle, s.theta, s.theta_dot, s.thrust,
+                          s.heat, s.flex, s.flex_dot, s.gust)
+
+
+@njit(cache=True, nogil=True)
+def _at(angles: Array, k: float) -> float:
+    """Angle of the rotor at a sample, also between two."""
+    before = math.floor(k)
+    a, b = angles[int(before) % HISTORY], angles[int(before + 1.0) % HISTORY]
+    return a + (k - before) * (b - a)
+
+
+def _kalman(chain: sensing.Chain, damping: float, period: float) -> Array:
+    """Gains (5,) of angle, rate, unknown torque and both stages of the angle filter, for an error of the reading."""
+    filtered = chain.filter_rate > 0.0
+    a = np.zeros((5, 5))
+    a[0, 1] = a[1, 2] = 1.0
+    a[1, 1] = -damping
+    if filtered:
+        a[3, 0] = a[4, 3] = chain.filter_rate
+        a[3, 3] = a[4, 4] = -chain.filter_rate
+    size, seen = (5, 4) if filtered else (3, 0)
+    transition = expm(a[:size, :size] * period)
+    kick = np.diag(np.array([0.0, 0.0, DISTURBANCE**2 * period, 0.0, 0.0])[:size])
+    noise = max(chain.angle_noise**2 + chain.angle_lsb**2 / 12.0, LEAST_NOISE**2)
+    c = np.zeros((1, size))
+    c[0, seen] = 1.0
+    spread = solve_discrete_are(transition.T, c.T, kick, np.array([[noise]]))
+    gain = np.zeros(5)
+    gain[:size] = spread[:, seen] / (spread[seen, seen] + noise)
+    if not filtered:
+        gain[3] = gain[4] = gain[0]
+    return gain

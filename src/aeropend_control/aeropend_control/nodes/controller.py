@@ -1,0 +1,329 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node that every control law runs in: topics, timing and safety.
+
+A sample of the rig is two messages with the same stamp, `joint_states` and `armature`. As soon as both are there the
+law is stepped, once a sample, and its duty is published on `duty_command`. Whether it is stepped, and whether its duty
+goes out, the `Supervisor` decides. However the node ends, duty 0 is the last command.
+
+Gains and limits can be set while it runs: the law takes them without a bump, or refuses them and goes on.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import BatteryState, JointState
+from std_msgs.msg import Float64
+
+from aeropend_control.laws.registry import LAWS, GainError, Law, LawKind, TuningError
+from aeropend_control.nodes import wire
+from aeropend_control.nodes.supervisor import Supervisor
+from aeropend_sim.model.parameters import PRESETS, ModelError, load
+from aeropend_sim.model.rig import Sample
+from aeropend_sim.ros import interface
+from aeropend_sim.ros.program import Diagnostics, Setting, Usage, UserError, overrides, read_settings, run, usage
+from aeropend_sim.ros.realtime import go_before_other_programs
+
+WATCH_S = 0.01
+"""How often the node looks whether samples still come, s."""
+WAITING = 100
+"""Halves of samples that wait for their other half."""
+AGAIN_S = 10.0
+"""A fault that was logged is logged again only when it has been away for longer, s."""
+WARM_UP = 20
+"""Samples that a law is run on before the first real one, so that what it calls is compiled."""
+
+ARM, ROTOR = interface.JOINTS
+TUNED = "tuned"
+
+
+def settings(kind: LawKind) -> dict[str, Setting]:
+    """Every parameter of a law's node but its gains."""
+    low, high = kind.reference_limits
+    unit = kind.reference_unit
+    return {
+        "model": Setting(
+            "bench", "what the law is made for, a model file may be augmented.yaml too", choices=PRESETS, path=True
+        ),
+        "gains": Setting(
+            TUNED, "gains that are not given: computed for the model, or a set by name", choices=(TUNED, *kind.presets)
+        ),
+        "reference_min": Setting(low, "least reference that is taken", unit, low, high, live=True),
+        "reference_max": Setting(high, "greatest reference that is taken", unit, low, high, live=True),
+        "angle_limit": Setting(
+            1.4, "an arm beyond it, either way, gets duty 0 until the next reference", "rad", 0.1, math.pi, live=True
+        ),
+        "timeout": Setting(0.05, "time without a sample after which the duty is 0", "s", 0.01, 10.0, live=True),
+    }
+
+
+def usage_of(name: str) -> Usage:
+    """What `--help` of a law's node says."""
+    kind = LAWS[name]
+    gains = [
+        f"  {gain:<18} {q.description}; {q.low:g}..{q.high:g} {q.unit}".removesuffix(" -")
+        + ("" if q.default is None else f"; default {q.default:g}")
+        for gain, q in kind.parameters.items()
+    ]
+    return usage(
+        f"{name}: {kind.summary}.\nTakes joint_states, armature and reference ({kind.reference_unit}), publishes "
+        "duty_command.",
+        settings(kind),
+        [
+            name,
+            f"{name} --ros-args -p model:=verdict/augmented.yaml",
+            f"{name} --ros-args -r __ns:=/rig1 -p angle_limit:=1.0",
+        ],
+        "\n".join(
+            ["gains, given in the same way:", *gains, "", "Gains and limits can be set while it runs: ros2 param set."]
+        ),
+        further={gain: Setting(q.low, q.description) for gain, q in kind.parameters.items()},
+    )
+
+
+class Controller(Node):
+    """A law in its node; see the module's docstring."""
+
+    def __init__(self, name: str) -> None:
+        """Prepare a law.
+
+        Args:
+            name: a key of `LAWS`, which is the node's name too.
+
+        Raises:
+            UserError: a parameter, the model file or a gain cannot be used.
+        """
+        super().__init__(name, automatically_declare_parameters_from_overrides=True)
+        self._kind = LAWS[name]
+        values = self._read()
+        self._supervisor = Supervisor(
+            self._law,
+            measures=(self._kind.measures,),
+            unit=self._kind.reference_unit,
+            low=values["reference_min"],
+            high=values["reference_max"],
+            angle_limit=values["angle_limit"],
+            timeout=values["timeout"],
+        )
+        self._joints: dict[int, tuple[float, float]] = {}
+        self._armatures: dict[int, list[float]] = {}
+        self._heard = False
+        self._quiet = 0  # looks since the last sample
+        self._longest_ns = 0
+        self._malformed = 0  # messages
+        self._logged: dict[str, float] = {}
+        self._load = (time.monotonic(), time.process_time())
+
+        qos = interface.QOS
+        self._publisher = self.create_publisher(Float64, interface.DUTY_COMMAND, qos)
+        self.create_subscription(JointState, interface.JOINT_STATES, self._on_joint_states, qos, raw=True)
+        self.create_subscription(BatteryState, interface.ARMATURE, self._on_armature, qos, raw=True)
+        self.create_subscription(Float64, interface.REFERENCE, self._on_reference, qos)
+        # wall time: where no sample comes, no /clock moves either
+        self._watch = self.create_timer(WATCH_S, self._on_watch, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._diagnostics = Diagnostics(self, self._report, name)
+        self.add_on_set_parameters_callback(self._on_set_parameters)
+        said = ", ".join(f"{key} {values[key]:.4g}" for key in self._kind.parameters)
+        self.get_logger().info(f"model {values['model']}, {said}")
+        gc.collect()
+        gc.freeze()  # the collector need not look at all this between two samples
+        go_before_other_programs()
+
+    def close(self) -> None:
+        """Send duty 0 ten times over 0.2 s: confirmation by the middleware would take up to 3 s (its heartbeat)."""
+        for _ in range(10):
+            self._publisher.publish(Float64(data=0.0))
+            time.sleep(0.02)
+
+    # ---- parameters ------------------------------------------------------------------------------------------------
+
+    def _read(self) -> dict[str, Any]:
+        """Make the law of the parameters given, and declare them all."""
+        given = overrides(self)
+        if any(name.startswith(("model.", "sensing.", "effects.")) for name in given):
+            raise UserError("the numbers of a model come as a file: -p model:=FILE")
+        table = settings(self._kind)
+        source, choice = (table[name].check(name, given.get(name, table[name].default)) for name in ("model", "gains"))
+        try:
+            model = load(source)
+            gains: dict[str, float] = dict(self._kind.presets.get(choice, {}))
+            gains |= {name: value for name, value in given.items() if name in self._kind.parameters}
+            if not gains.keys() >= self._kind.parameters.keys():
+                gains = {**self._kind.tune(model), **gains}
+            self._law = self._kind.make(model, gains)
+        except (ModelError, GainError, TuningError) as error:
+            raise UserError(str(error)) from error
+        _warm_up(self._law, self._kind)
+        self._table = table | {
+            name: Setting(float(gains[name]), q.description, q.unit.removeprefix("-"), q.low, q.high, live=True)
+            for name, q in self._kind.parameters.items()
+        }
+        values = read_settings(self, self._table, given)
+        _check_order(values)
+        return values
+
+    def _on_set_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        """Take all of these, or none."""
+        named = {one.name: one.value for one in parameters if one.name in self._table}
+        supervisor = self._supervisor
+        try:
+            new = {name: self._table[name].check(name, value) for name, value in named.items()}
+            _check_order({"reference_min": supervisor.low, "reference_max": supervisor.high, **new})
+            self._law.retune({name: value for name, value in new.items() if name in self._kind.parameters})
+        except (UserError, GainError) as error:
+            self.get_logger().warn(f"refused, and the loop goes on: {error}")
+            return SetParametersResult(successful=False, reason=str(error))
+        supervisor.low = new.get("reference_min", supervisor.low)
+        supervisor.high = new.get("reference_max", supervisor.high)
+        supervisor.angle_limit = new.get("angle_limit", supervisor.angle_limit)
+        supervisor.timeout = new.get("timeout", supervisor.timeout)
+        return SetParametersResult(successful=True)
+
+    # ---- messages --------------------------------------------------------------------------------------------------
+
+    def _on_joint_states(self, message: bytes) -> None:
+        try:
+            stamp, position, velocity = wire.joints(message)
+        except wire.MALFORMED:
+            self._malformed += 1
+            return
+        reading = (position.get(ARM, math.nan), velocity.get(ROTOR, math.nan))
+        other = self._armatures.pop(stamp, None)
+        if other is None:
+            _keep(self._joints, stamp, reading)
+        else:
+            self._on_sample(stamp, *reading, *other)
+
+    def _on_armature(self, message: bytes) -> None:
+        try:
+            stamp, *reading = wire.armature(message)
+        except wire.MALFORMED:
+            self._malformed += 1
+            return
+        other = self._joints.pop(stamp, None)
+        if other is None:
+            _keep(self._armatures, stamp, reading)
+        else:
+            self._on_sample(stamp, *other, *reading)
+
+    def _on_sample(self, stamp: int, theta: float, omega: float, i_a: float, v_a: float, applied: float) -> None:
+        start = time.monotonic_ns()
+        self._heard, self._quiet = True, 0
+        supervisor = self._supervisor
+        supervisor.applied(applied)
+        duty = supervisor.step(stamp, Sample(theta, omega, i_a, v_a))
+        if duty is not None:
+            self._publisher.publish(wire.float64(duty))
+            self._longest_ns = max(self._longest_ns, time.monotonic_ns() - start)
+        if supervisor.fault:
+            self._say(supervisor.fault)
+
+    def _on_reference(self, message: Float64) -> None:
+        supervisor = self._supervisor
+        before = supervisor.reference
+        if not supervisor.refer(message.data):
+            self._say(supervisor.refusal)
+        elif supervisor.reference != before:
+            self.get_logger().info(f"reference {supervisor.reference:g} {self._kind.reference_unit}")
+
+    def _on_watch(self) -> None:
+        # looks are counted, not time: when this process stood still, samples wait in the queue behind the first look
+        self._quiet += 1
+        supervisor = self._supervisor
+        if self._heard and self._quiet * WATCH_S > supervisor.timeout:
+            self._heard = False
+            supervisor.silent()
+            self._publisher.publish(Float64(data=0.0))
+            self._say(supervisor.fault)
+
+    # ---- what is told ----------------------------------------------------------------------------------------------
+
+    def _say(self, fault: str) -> None:
+        """Log a fault once, and again when it has been away for a while."""
+        now = time.monotonic()
+        if now > self._logged.get(fault, -math.inf) + AGAIN_S:
+            self.get_logger().warn(fault)
+        self._logged[fault] = now
+
+    def _report(self) -> tuple[str, Mapping[str, object]]:
+        supervisor = self._supervisor
+        warnings = [supervisor.fault, supervisor.refusal]
+        for topic, ours in ((interface.DUTY_COMMAND, 1), (interface.JOINT_STATES, 1)):
+            others = self.count_publishers(topic) - ours
+            if others > 0:
+                warnings.append(f"{others + 1} publishers of {topic}: end all but one")
+                self._say(warnings[-1])
+        if not self._heard and not supervisor.fault:
+            warnings.append("no sample yet, which is joint_states and armature with the same stamp: duty 0")
+        wall, cpu = time.monotonic(), time.process_time()
+        load = (cpu - self._load[1]) / (wall - self._load[0]) if wall > self._load[0] else 0.0
+        self._load = (wall, cpu)
+        values = {
+            "reference": supervisor.reference,
+            "duty": supervisor.duty,
+            **supervisor.counts,
+            "malformed": self._malformed,
+            "longest step ms": 1e-6 * self._longest_ns,
+            "cpu share": load,
+        }
+        return "; ".join(filter(None, warnings)), values
+
+
+def _keep(waiting: dict[int, Any], stamp: int, half: Any) -> None:
+    """Let half a sample wait for the other; what waits too long goes."""
+    waiting[stamp] = half
+    if len(waiting) > WAITING:
+        del waiting[next(iter(waiting))]
+
+
+def _check_order(values: Mapping[str, float]) -> None:
+    if not values["reference_min"] < values["reference_max"]:
+        raise UserError("parameters reference_min and reference_max: give reference_min < reference_max")
+
+
+def _warm_up(law: Law, kind: LawKind) -> None:
+    """Run a law so that its first real sample finds everything compiled."""
+    for k in range(WARM_UP):
+        law.step(Sample(0.01 * k, 50.0, 0.1, 0.5), sum(kind.reference_limits) / 2.0)
+    law.reset()
+
+
+def main(name: str, args: Sequence[str] | None = None) -> int:
+    """Run the node of a law."""
+    return run(partial(Controller, name), args, usage_of(name))
+
+
+def small_signal(args: Sequence[str] | None = None) -> int:
+    """Entry point of `small_signal`."""
+    return main("small_signal", args)
+
+
+def feedback_linearization(args: Sequence[str] | None = None) -> int:
+    """Entry point of `feedback_linearization`."""
+    return main("feedback_linearization", args)
+
+
+def cascade(args: Sequence[str] | None = None) -> int:
+    """Entry point of `cascade`."""
+    return main("cascade", args)
+
+
+def feedback_linearization_cascade(args: Sequence[str] | None = None) -> int:
+    """Entry point of `feedback_linearization_cascade`."""
+    return main("feedback_linearization_cascade", args)
+
+
+if __name__ == "__main__":  # python -m aeropend_control.nodes.controller LAW --ros-args ...
+    sys.argv[:2] = sys.argv[1:2]
+    sys.exit(main(sys.argv[0]))

@@ -1,0 +1,419 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording as arrays: the samples of one rig, joined on their stamps.
+
+Example:
+    >>> recording = read("my_bag")
+    >>> recording.t, recording.theta, recording.duty  # s, rad, 0..1
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeropend_ident.bags.bag import Bag, RecordingError
+from aeropend_ident.bags.cdr import Block, decode
+
+__all__ = ["CHANNELS", "Recording", "RecordingError", "Truth", "holds", "read", "split_topic"]
+
+Floats = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+CHANNELS = ("theta", "omega", "i_a", "v_a", "duty")
+
+OFF_GRID = 0.25
+"""Part of a period by which a step between stamps may miss the grid."""
+
+IRREGULAR = 0.01
+"""Share of steps off the grid from which on it is said."""
+
+_JOINT, _BATTERY, _FLOAT = "sensor_msgs/msg/JointState", "sensor_msgs/msg/BatteryState", "std_msgs/msg/Float64"
+_TOPICS = {
+    "truth/joint_states": _JOINT,
+    "truth/armature": _BATTERY,
+    "joint_states": _JOINT,
+    "armature": _BATTERY,
+    "duty_command": _FLOAT,
+    "reference": _FLOAT,
+}
+_ARM, _ROTOR = "arm", "rotor"
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The plant's states before its measurement chain, on the stamps of the samples; NaN where missing.
+
+    Attributes:
+        theta: (N,) arm angle, rad.
+        theta_dot: (N,) arm speed, rad/s.
+        omega: (N,) rotor speed, rad/s.
+        i_a: (N,) armature current, A.
+        v_a: (N,) armature voltage, V.
+    """
+
+    theta: Floats
+    theta_dot: Floats
+    omega: Floats
+    i_a: Floats
+    v_a: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """The samples of one rig in the order of their stamps; NaN where a channel is unmeasured or a message is missing.
+
+    Attributes:
+        path: the bag.
+        namespace: where the rig's topics are: "/", "/rig1".
+        stamp_ns: (N,) instants of sampling, strictly rising, ns.
+        received_ns: (N,) when the sample was recorded, by the recorder's clock, ns.
+        t: (N,) time since the first sample, s.
+        theta: (N,) arm angle from hanging, rad.
+        omega: (N,) rotor speed, rad/s.
+        i_a: (N,) armature current, A.
+        v_a: (N,) armature voltage, V.
+        duty: (N,) duty applied, 0..1.
+        channels: those of theta, omega, i_a, v_a, duty that hold a number at all.
+        period: sample period estimated from the stamps, s; NaN for a single sample.
+        gaps: (M, 2) for every gap the index of the sample before it and the number of samples that are missing.
+        duplicates: messages whose stamp had been there before (the first one counts).
+        command_ns: (K,) receive times of duty_command, ns.
+        command: (K,) duty commanded, as sent (not clamped, maybe NaN).
+        reference_ns: (L,) receive times of reference, ns.
+        reference: (L,) reference, rad (rad/s for the bare cascade).
+        truth: what the plant published below truth/, if it was recorded.
+        complete: whether the bag was closed and is undamaged.
+        notes: what a user should know about this recording, one line each.
+    """
+
+    path: str
+    namespace: str
+    stamp_ns: Stamps
+    received_ns: Stamps
+    t: Floats
+    theta: Floats
+    omega: Floats
+    i_a: Floats
+    v_a: Floats
+    duty: Floats
+    channels: tuple[str, ...]
+    period: float
+    gaps: Stamps
+    duplicates: int
+    command_ns: Stamps
+    command: Floats
+    reference_ns: Stamps
+    reference: Floats
+    truth: Truth | None
+    complete: bool
+    notes: tuple[str, ...]
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return len(self.stamp_ns)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first sample to the last, s."""
+        return float(self.t[-1])
+
+    @property
+    def lost(self) -> int:
+        """Samples missing on the grid between the first and the last."""
+        return int(self.gaps[:, 1].sum())
+
+
+def read(path: Path | str, namespace: str | None = None) -> Recording:
+    """Read a bag into arrays.
+
+    joint_states and armature are joined on header.stamp, whatever order they arrived in. Without armature the duty is
+    that of the last duty_command received before the sample; `notes` says so.
+
+    Args:
+        path: a rosbag2 folder (metadata up to version 9) or a bare .mcap or .db3 file, broken off or not.
+        namespace: the rig to read when the bag holds several: "/rig1".
+
+    Raises:
+        RecordingError: the bag cannot be used; the message is one line that says what to do.
+    """
+    bag = Bag(path)
+    series: dict[tuple[str, str], _Series] = {}
+    for connection, time, data in bag.messages(lambda topic, msgtype: split_topic(topic, msgtype) is not None):
+        key = (connection.topic, connection.msgtype)
+        try:
+            one = series[key]
+        except KeyError:
+            one = series[key] = _Series(connection.topic, connection.msgtype)
+        one.times.append(time)
+        one.messages.append(data)
+    rigs = _rigs(series, bag)
+    found = _choose(rigs, namespace, bag)
+    notes: list[str] = []
+    try:
+        recording = _Join(rigs[found], notes).recording(str(path), found, complete=not bag.problems)
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from None
+    if not bag.problems:
+        return recording
+    what = f"{bag.counts.total()} messages and {recording.duration:.3f} s of samples could be read"
+    return replace(recording, notes=(*bag.problems, what, *recording.notes))
+
+
+def holds(duty: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Where in a duty (N,) each hold begins, and how many samples it lasts."""
+    start = np.flatnonzero(np.append(True, np.diff(duty) != 0.0))
+    return start, np.diff(np.append(start, len(duty)))
+
+
+def split_topic(topic: str, msgtype: str) -> tuple[str, str] | None:
+    """Split a topic of a rig into its namespace ("/", "/rig1") and name; None when it is none, or has another type."""
+    for name, expected in _TOPICS.items():
+        if msgtype == expected and (topic == name or topic.endswith("/" + name)):
+            rest = topic[: -len(name)].strip("/")
+            return "/" + rest, name
+    return None
+
+
+class _Series:
+    """The messages of one topic as they lie in the bag."""
+
+    def __init__(self, topic: str, msgtype: str) -> None:
+        self.topic = topic
+        self.msgtype = msgtype
+        self.times: list[int] = []
+        self.messages: list[bytes] = []
+
+
+def _rigs(series: dict[tuple[str, str], _Series], bag: Bag) -> dict[str, dict[str, _Series]]:
+    """Sort the series into rigs: namespace -> topic -> series. A rig has an armature, or a joint named arm or rotor."""
+    rigs: dict[str, dict[str, _Series]] = {}
+    for one in series.values():
+        split = split_topic(one.topic, one.msgtype)
+        assert split is not None
+        rigs.setdefault(split[0], {})[split[1]] = one
+    strangers = []
+    for place, topics in list(rigs.items()):
+        joints = topics.get("joint_states")
+        if joints is not None and not _has_our_joints(joints):
+            strangers.append(joints.topic)
+            del topics["joint_states"]
+        if not {"joint_states", "armature"} & set(topics):
+            del rigs[place]
+    if rigs:
+        return rigs
+    if strangers:
+        raise RecordingError(f"{bag.path}: {', '.join(strangers)} has no joint named {_ARM} or {_ROTOR}")
+    if not bag.counts.total():
+        why = f" ({bag.problems[0]})" if bag.problems else ""
+        raise RecordingError(f"{bag.path}: holds no messages{why}")
+    there = [f"{topic} ({msgtype}, {count})" for (topic, msgtype), count in sorted(bag.counts.items())]
+    listed = ", ".join(there[:8]) + (f" and {len(there) - 8} more" if len(there) > 8 else "")
+    raise RecordingError(f"{bag.path}: no message of joint_states or armature in it; it holds {listed}")
+
+
+def _has_our_joints(joints: _Series) -> bool:
+    blocks, _ = decode(joints.messages[:1], _JOINT)
+    return not blocks or bool({_ARM, _ROTOR} & set(blocks[0].names.get("name", ())))
+
+
+def _choose(rigs: dict[str, dict[str, _Series]], namespace: str | None, bag: Bag) -> str:
+    there = ", ".join(sorted(rigs))
+    if namespace is None:
+        if len(rigs) > 1:
+            raise RecordingError(f"{bag.path}: holds several rigs: {there}; choose one with --namespace")
+        return next(iter(rigs))
+    wanted = "/" + namespace.strip("/")
+    if wanted not in rigs:
+        raise RecordingError(f"{bag.path}: no rig in namespace {wanted}; it holds {there}")
+    return wanted
+
+
+@dataclass(eq=False)
+class _Table:
+    """The messages of one topic as columns, sorted by stamp."""
+
+    stamps: Stamps
+    received: Stamps
+    columns: dict[str, Floats]
+
+
+class _Join:
+    """The topics of one rig, joined on the stamps."""
+
+    def __init__(self, topics: dict[str, _Series], notes: list[str]) -> None:
+        self.notes = notes
+        self.duplicates = 0
+        empty = _Table(np.empty(0, np.int64), np.empty(0, np.int64), {})
+        joints = self._joints(topics["joint_states"]) if "joint_states" in topics else empty
+        armature = self._armature(topics["armature"]) if "armature" in topics else empty
+        if len(joints.stamps) and len(armature.stamps):
+            common = len(np.intersect1d(joints.stamps, armature.stamps, assume_unique=True))
+            if not common:
+                notes.append("no stamp of armature equals one of joint_states: armature is left out")
+                armature = empty
+            elif alone := len(joints.stamps) - common:
+                notes.append(f"{_many(alone, 'sample')} of joint_states {_has(alone)} no armature of the same stamp")
+            if common and (alone := len(armature.stamps) - common):
+                notes.append(f"{_many(alone, 'sample')} of armature {_has(alone)} no joint_states of the same stamp")
+        self.stamps = np.union1d(joints.stamps, armature.stamps)
+        if not len(self.stamps):
+            raise RecordingError(f"no sample could be read: {'; '.join(notes)}")
+        self.received = np.zeros(len(self.stamps), dtype=np.int64)
+        for table in (armature, joints):  # where both are there, the arrival of joint_states counts
+            self.received[np.searchsorted(self.stamps, table.stamps)] = table.received
+        self.columns = self._placed((armature, joints), CHANNELS)
+        self.command = self._values(topics.get("duty_command"))
+        self.reference = self._values(topics.get("reference"))
+        if not len(armature.stamps):
+            self._take_duty_from_command()
+        repeated = self.duplicates
+        self.truth = self._truth(topics)
+        self.duplicates = repeated
+        self.period, self.gaps, self.irregular = _grid(self.stamps)
+
+    def recording(self, path: str, namespace: str, *, complete: bool) -> Recording:
+        """Say what there is to say, and hand over the arrays."""
+        channels = tuple(name for name in CHANNELS if np.isfinite(self.columns[name]).any())
+        if unmeasured := [name for name in CHANNELS if name not in channels]:
+            self.notes.append(f"not measured: {', '.join(unmeasured)}")
+        if self.duplicates:
+            repeat = "repeats" if self.duplicates == 1 else "repeat"
+            self.notes.append(f"{_many(self.duplicates, 'message')} {repeat} a stamp: the first of each counts")
+        if len(self.gaps):
+            missing = int(self.gaps[:, 1].sum())
+            are = "is" if missing == 1 else "are"
+            self.notes.append(f"{_many(missing, 'sample')} {are} missing in {_many(len(self.gaps), 'gap')}")
+        if self.irregular > IRREGULAR * len(self.stamps) or len(self.gaps) > 0.25 * len(self.stamps):
+            self.notes.append("the stamps do not lie on one grid: two rigs on one topic, or most samples were lost")
+        return Recording(
+            path=path,
+            namespace=namespace,
+            stamp_ns=self.stamps,
+            received_ns=self.received,
+            t=(self.stamps - self.stamps[0]) / 1e9,
+            **self.columns,
+            channels=channels,
+            period=self.period,
+            gaps=self.gaps,
+            duplicates=self.duplicates,
+            command_ns=self.command[0],
+            command=self.command[1],
+            reference_ns=self.reference[0],
+            reference=self.reference[1],
+            truth=self.truth,
+            complete=complete,
+            notes=tuple(self.notes),
+        )
+
+    def _joints(self, series: _Series) -> _Table:
+        columns = {name: np.full(len(series.messages), np.nan) for name in ("theta", "theta_dot", "omega")}
+        blocks = self._decode(series)
+        for block in blocks:
+            names = block.names.get("name", ())
+            for column, joint, field in (
+                ("theta", _ARM, "position"),
+                ("theta_dot", _ARM, "velocity"),
+                ("omega", _ROTOR, "velocity"),
+            ):
+                values = block.numbers[field]
+                if joint in names and names.index(joint) < values.shape[1]:
+                    columns[column][block.rows] = values[:, names.index(joint)]
+        return self._table(series, blocks, columns)
+
+    def _armature(self, series: _Series) -> _Table:
+        columns = {name: np.full(len(series.messages), np.nan) for name in ("v_a", "i_a", "duty")}
+        blocks = self._decode(series)
+        for block in blocks:
+            for column, field in (("v_a", "voltage"), ("i_a", "current"), ("duty", "percentage")):
+                columns[column][block.rows] = block.numbers[field]
+        return self._table(series, blocks, columns)
+
+    def _values(self, series: _Series | None) -> tuple[Stamps, Floats]:
+        """Read a series of std_msgs/Float64: receive times and values, sorted by time."""
+        if series is None:
+            return np.empty(0, np.int64), np.empty(0)
+        blocks = self._decode(series)
+        rows = np.concatenate([block.rows for block in blocks] or [np.empty(0, np.int64)])
+        values = np.concatenate([block.numbers["data"] for block in blocks] or [np.empty(0)]).astype(np.float64)
+        times = np.array(series.times, dtype=np.int64)[rows]
+        order = np.lexsort((rows, times))
+        return times[order], values[order]
+
+    def _decode(self, series: _Series) -> list[Block]:
+        blocks, failed = decode(series.messages, series.msgtype)
+        if failed:
+            self.notes.append(f"{_many(len(failed), 'message')} of {series.topic} could not be decoded")
+        return blocks
+
+    def _table(self, series: _Series, blocks: list[Block], columns: dict[str, Floats]) -> _Table:
+        """Date the decoded messages and sort them, the first one of equal stamps only."""
+        stamps = np.zeros(len(series.messages), dtype=np.int64)
+        understood = np.zeros(len(series.messages), dtype=bool)
+        for block in blocks:
+            seconds = block.numbers["header.stamp.sec"].astype(np.int64)
+            stamps[block.rows] = seconds * 1_000_000_000 + block.numbers["header.stamp.nanosec"]
+            understood[block.rows] = True
+        if understood.sum() > 1 and not stamps.any():
+            raise RecordingError(f"{series.topic}: header.stamp is never set, so its samples cannot be dated or joined")
+        rows = np.flatnonzero(understood)
+        sorted_stamps, first = np.unique(stamps[rows], return_index=True)
+        self.duplicates += len(rows) - len(first)
+        rows = rows[first]
+        received = np.array(series.times, dtype=np.int64)[rows]
+        return _Table(sorted_stamps, received, {name: values[rows] for name, values in columns.items()})
+
+    def _placed(self, tables: Iterable[_Table], names: Iterable[str]) -> dict[str, Floats]:
+        """Put columns of tables on the samples; stamps that are no samples are left out."""
+        columns = {name: np.full(len(self.stamps), np.nan) for name in names}
+        for table in tables:
+            _, rows, known = np.intersect1d(self.stamps, table.stamps, assume_unique=True, return_indices=True)
+            for name in columns.keys() & table.columns.keys():
+                columns[name][rows] = table.columns[name][known]
+        return columns
+
+    def _take_duty_from_command(self) -> None:
+        """Hold the last command the rig would have taken: finite, clamped to 0..1."""
+        times, values = self.command
+        taken = np.isfinite(values)
+        if not taken.any():
+            return
+        times, values = times[taken], np.clip(values[taken], 0.0, 1.0)
+        last = np.searchsorted(times, self.received, side="right") - 1
+        self.columns["duty"] = np.where(last >= 0, values[last], np.nan)
+        self.notes.append("no armature: the duty is that of duty_command by the time it was received")
+
+    def _truth(self, topics: dict[str, _Series]) -> Truth | None:
+        tables = []
+        if "truth/joint_states" in topics:
+            tables.append(self._joints(topics["truth/joint_states"]))
+        if "truth/armature" in topics:
+            tables.append(self._armature(topics["truth/armature"]))
+        return Truth(**self._placed(tables, ("theta", "theta_dot", "omega", "i_a", "v_a"))) if tables else None
+
+
+def _grid(stamps: Stamps) -> tuple[float, Stamps, int]:
+    """Estimate the period (s), find the gaps and count the steps that fit no grid.
+
+    A gap is the index of the sample before it and the number of samples missing.
+    """
+    steps = np.diff(stamps)
+    if not len(steps):
+        return float("nan"), np.empty((0, 2), dtype=np.int64), 0
+    periods = np.rint(steps / np.median(steps)).astype(np.int64)
+    before = np.flatnonzero(periods > 1)
+    usual = np.abs(steps / np.median(steps) - 1.0) < OFF_GRID  # a pause need not be a whole number of periods
+    period = float(steps[usual].mean()) / 1e9
+    irregular = int(np.sum(np.abs(steps / np.median(steps) - periods) > OFF_GRID))
+    return period, np.stack((before, periods[before] - 1), axis=1), irregular
+
+
+def _many(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def _has(number: int) -> str:
+    return "has" if number == 1 else "have"

@@ -1,0 +1,450 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The motor's and the propeller's numbers from bench tests: steady states and one current step. Pure.
+
+Every test takes `Rows`, a table of what was read, typed in from a bench or made from the plateaus of a recording, and
+returns `Estimate`s. Where a table's rows carry no uncertainty of their own, it is taken from how they scatter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+
+from aeropend_ident.bags.recording import Recording, holds
+from aeropend_ident.identification.terms import Array
+from aeropend_ident.tables.units import RPM
+from aeropend_sim.model import actuator
+from aeropend_sim.model.parameters import PARAMETERS
+
+GEAR = 55.0 / 9.0
+"""The thesis' gear ratio N1/N2: it counts K_q on the propeller's side, k_thrust = K_q (55/9)² (3.3, 3.4)."""
+
+SURE = 3.0
+"""Standard deviations from which on something is said."""
+
+SETTLED = 0.01
+"""Change within a plateau, as a share of the channel's range, up to which a reading counts as steady."""
+
+HOLD = 1.0
+"""s that a duty must be held for its plateau to count; what is read is its last half."""
+
+
+class BenchTestError(ValueError):
+    """A table or a recording from which a bench test cannot be worked out; the message is one line for a person."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What was read, row by row, SI.
+
+    Attributes:
+        name: where from, for messages.
+        columns: (N,) by quantity: t, v_a, i_a, omega, duty, thrust, theta.
+        sigma: (N,) standard deviation by quantity, where it is known.
+        notes: what was noticed while reading.
+    """
+
+    name: str
+    columns: Mapping[str, Array]
+    sigma: Mapping[str, Array] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    def where(self, keep: NDArray[np.intp]) -> Rows:
+        """The rows with these indices."""
+        return Rows(self.name, {k: x[keep] for k, x in self.columns.items()},
+                    {k: x[keep] for k, x in self.sigma.items()})
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values())))
+
+    def take(self, *names: str, least: int = 3) -> list[Array]:
+        """Columns by name, then their standard deviations (0: unknown), without rows in which a column is missing.
+
+        Raises:
+            BenchTestError: a column is not there, or fewer than `least` rows are left.
+        """
+        for name in names:
+            if name not in self.columns:
+                raise BenchTestError(f"{self.name}: {name} is not in it; it has {', '.join(self.columns)}")
+        table = np.column_stack([self.columns[name] for name in names]
+                                + [self.sigma.get(name, np.zeros(len(self))) for name in names])
+        table = table[np.isfinite(table).all(axis=1)]
+        if len(table) < least:
+            raise BenchTestError(f"{self.name}: {len(table)} rows hold {' and '.join(names)}; give at least {least}")
+        return list(table.T)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its standard deviation. `scatter`: that of a single row. `how`: the estimator, in words."""
+
+    value: float
+    sigma: float
+    unit: str
+    how: str
+    scatter: float = math.nan
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Points and the curve through them, for a plot."""
+
+    title: str
+    x_label: str
+    y_label: str
+    x: Array
+    y: Array
+    curve: Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a bench test gives.
+
+    Attributes:
+        source: where from. rows: how many were used.
+        numbers: estimates of numbers of the model file, by name.
+        others: what else was worked out, by name.
+        notes: what a person should know.
+        panels: for the plot.
+    """
+
+    source: str
+    rows: int
+    numbers: Mapping[str, Estimate]
+    others: Mapping[str, Estimate] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    panels: tuple[Panel, ...] = ()
+
+
+def mean_of(values: Array, unit: str, how: str, sigma: Array | None = None) -> Estimate:
+    """The mean of (N,) rows, its standard deviation, and the rows' scatter.
+
+    With a standard deviation for each row the mean is weighted, and what the rows scatter beyond it counts for all of
+    them alike (DerSimonian and Laird, Controlled Clinical Trials 7, 1986).
+    """
+    scatter = float(np.std(values, ddof=1))
+    weights = np.ones(len(values)) / scatter**2 if scatter > 0.0 else np.ones(len(values))
+    if sigma is not None and (sigma > 0.0).all():
+        w = sigma**-2.0
+        excess = float(np.sum(w * (values - np.average(values, weights=w)) ** 2)) - (len(values) - 1)
+        weights = 1.0 / (sigma**2 + max(excess, 0.0) / float(w.sum() - np.sum(w * w) / w.sum()))
+    spread = 1.0 / math.sqrt(float(weights.sum())) if scatter > 0.0 else 0.0
+    return Estimate(float(np.average(values, weights=weights)), spread, unit, how, scatter)
+
+
+def blocked_rotor(rows: Rows) -> Found:
+    """R_a from pairs of armature voltage and current with the rotor blocked (thesis 4.4.1, Table 4.1): the mean of v/i.
+
+    Raises:
+        BenchTestError: columns or rows are missing, no current flows, or the rotor turned.
+    """
+    v, i, dv, di = rows.take("v_a", "i_a")
+    if "omega" in rows.columns and np.nanmax(np.abs(rows.columns["omega"])) > 0.0:
+        raise BenchTestError(f"{rows.name}: the rotor turned, so v_a is not R_a i_a; block it, or use --steady")
+    _positive(rows, i_a=i, v_a=v)
+    found = mean_of(v / i, "Ω", "mean of v_a/i_a", np.hypot(dv, v / i * di) / i)
+    notes = []
+    (slope, offset), covariance = np.polyfit(i, v, 1, cov=True) if len(v) > 3 else ((found.value, 0.0), np.eye(2))
+    if abs(offset) > SURE * math.sqrt(covariance[1, 1]):
+        notes.append(f"v_a is {offset:.2g} V ± {math.sqrt(covariance[1, 1]):.1g} where i_a is 0: a reading is offset, "
+                     f"or the brushes take it; the slope alone gives R_a = {slope:.4g} Ω")
+    return Found(rows.name, len(v), {"R_a": found}, notes=tuple(notes), panels=(
+        Panel("blocked rotor", "i_a / A", "v_a / V", i, v, lambda x: found.value * x),))
+
+
+def current_step(rows: Rows, resistance: Estimate) -> Found:
+    """L_a from the current after a step of the voltage, rotor blocked (thesis 4.4.2): i = i_end (1 - exp(-(t - t0)/τ)).
+
+    The table starts at the step or before it; with a column v_a the step's instant is known, otherwise it is fitted.
+    L_a = τ R_a.
+
+    Raises:
+        BenchTestError: columns or rows are missing, or no rise is to be seen.
+    """
+    t, i, _, _ = rows.take("t", "i_a", least=6)
+    order = np.argsort(t, kind="stable")
+    t, i = t[order], i[order]
+    end = float(np.median(i[-max(3, len(i) // 4):]))
+    noise = float(np.std(i[-max(3, len(i) // 4):]))
+    if end <= SURE * noise or end <= 0.0:
+        raise BenchTestError(f"{rows.name}: the current does not rise above its noise; give the readings around a step "
+                             "of the voltage with the rotor blocked")
+    over = np.flatnonzero(i > 0.632 * end)[0]
+    start = t[max(int(over) - 1, 0)]
+
+    def left(p: Array) -> Array:
+        return np.asarray(p[0] * -np.expm1(-np.maximum(t - p[2], 0.0) / math.exp(p[1])) - i)
+
+    span = max(float(t[over] - t[0]), float(np.median(np.diff(t))))
+    fit = least_squares(left, [end, math.log(0.5 * span), start], x_scale=[end, 1.0, span])
+    freedom = max(len(t) - 3, 1)
+    covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * 2.0 * fit.cost / freedom
+    tau, spread = math.exp(fit.x[1]), math.sqrt(covariance[1, 1])
+    during = int(np.sum((t > fit.x[2]) & (t < fit.x[2] + 3.0 * tau)))
+    notes = []
+    if during < 3:
+        notes.append(f"only {during} readings fall within 3 τ of the step: sample faster for a τ to rely on")
+    time_constant = Estimate(tau, tau * spread, "s", "exponential fit")
+    inductance = Estimate(tau * resistance.value, tau * resistance.value
+                          * math.hypot(spread, resistance.sigma / resistance.value), "H", "τ_e R_a")
+    a, t0 = float(fit.x[0]), float(fit.x[2])
+    return Found(rows.name, len(t), {"L_a": inductance}, {"τ_e": time_constant}, tuple(notes), (
+        Panel("current step", "t / s", "i_a / A", t, i, lambda x: a * -np.expm1(-np.maximum(x - t0, 0.0) / tau)),))
+
+
+def blocked_recording(recording: Recording, name: str) -> Found:
+    """R_a and L_a from a recording of duty steps with the rotor blocked, by a fit of the current to the voltage.
+
+    The winding, L_a di/dt = v_a - R_a i_a (thesis 3.5 at ω = 0), is run over every hold of the voltage.
+
+    Raises:
+        BenchTestError: channels are missing, nothing happens, or the rotor turned.
+    """
+    v, i, t = recording.v_a, recording.i_a, recording.t
+    for channel in ("v_a", "i_a"):
+        if channel not in recording.channels:
+            raise BenchTestError(f"{name}: {channel} was not measured")
+    if "omega" in recording.channels and np.nanmax(np.abs(recording.omega)) > 0.0:
+        raise BenchTestError(f"{name}: the rotor turned, so v_a is not R_a i_a; block it, or use --steady")
+    if len(recording.gaps) or not np.isfinite(np.column_stack([v, i])).all():
+        raise BenchTestError(f"{name}: samples or readings are missing; record again")
+    starts, sizes = holds(recording.duty)
+    held = np.repeat(np.add.reduceat(v, starts) / sizes, sizes)  # the voltage over each hold, without its noise
+    before = np.append(held[0], held[:-1])
+    if np.ptp(np.add.reduceat(i, starts) / sizes) < SURE * float(np.std(np.diff(i))):
+        raise BenchTestError(f"{name}: no current flows above its noise; record steps of the duty")
+
+    def current(p: Array) -> Array:
+        """p: log R_a, log τ, and the share of a period by which a new voltage acts before the sample that shows it."""
+        tau, share = math.exp(p[1]), float(p[2])
+        decay, late = math.exp(-recording.period / tau), math.exp(-share * recording.period / tau)
+        driven = math.exp(-p[0]) * ((1.0 - late) * held + (late - decay) * before)
+        driven[0] = i[0]
+        return np.asarray(lfilter([1.0], [1.0, -decay], driven))
+
+    start = [math.log(float(np.sum(held * i) / np.sum(i * i))), math.log(recording.period), 0.25]
+    fit = least_squares(lambda p: current(p) - i, start, bounds=([-np.inf, -np.inf, 0.0], [np.inf, np.inf, 1.0]),
+                        diff_step=1e-4, x_scale=[0.01, 0.1, 0.1])
+    covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * 2.0 * fit.cost / (len(t) - 3)
+    r, tau = math.exp(fit.x[0]), math.exp(fit.x[1])
+    spread = np.sqrt(np.diag(covariance))
+    inductance = Estimate(r * tau, r * tau * math.sqrt(covariance[0, 0] + covariance[1, 1] + 2.0 * covariance[0, 1]),
+                          "H", "τ_e R_a")
+    resistance = Estimate(r, r * float(spread[0]), "Ω", "fit of the winding")
+    time_constant = Estimate(tau, tau * float(spread[1]), "s", "fit of the winding")
+    run = current(fit.x)
+    return Found(name, len(t), {"R_a": resistance, "L_a": inductance}, {"τ_e": time_constant}, (), (
+        Panel("blocked rotor: the current", "t / s", "i_a / A", t, i, lambda x: np.interp(x, t, run)),))
+
+
+def steady(rows: Rows, resistance: Estimate) -> Found:
+    """K_e from steady states (thesis 4.4.3, Table 4.2), and the load torque: K_e = (v_a - R_a i_a)/ω, K_t = K_e.
+
+    Of the electrical power K_e i_a ω nothing is lost on its way to the shaft, so both constants are one number in SI.
+    The load is k_load ω², with a viscous part B_m ω where the rows show one.
+
+    Raises:
+        BenchTestError: columns or rows are missing, or the rotor stood.
+    """
+    v, i, w, dv, di, dw = rows.take("v_a", "i_a", "omega")
+    _positive(rows, v_a=v, i_a=i, omega=w)
+    emf = v - resistance.value * i
+    constant = mean_of(emf / w, "V·s/rad", "mean of (v_a - R_a i_a)/ω",
+                       np.sqrt(dv**2 + (resistance.value * di) ** 2 + (emf / w * dw) ** 2) / w)
+    by_resistance = resistance.sigma * float(np.mean(i / w))
+    constant = Estimate(constant.value, math.hypot(constant.sigma, by_resistance), constant.unit, constant.how,
+                        constant.scatter)
+    if constant.value <= 0.0:
+        raise BenchTestError(f"{rows.name}: R_a i_a exceeds v_a, so R_a = {resistance.value:g} Ω cannot be; check it")
+    torque = constant.value * i
+    load = mean_of(torque / w**2, "N·m·s²/rad²", "mean of K_t i_a/ω²",
+                   constant.value * np.hypot(di, 2.0 * i / w * dw) / w**2)
+    numbers = {"K_e": constant, "K_t": constant}
+    viscous = Estimate(0.0, 0.0, "N·m·s/rad", "not seen")
+    if len(w) > 3:
+        # without their own uncertainty, rows have equal relative weight
+        weight = 1.0 / (constant.value * np.hypot(di, 2.0 * i / w * dw) if (di > 0.0).all() else torque)
+        (b, k), covariance = _lines(weight[:, None] * np.column_stack([w, w * w]), weight * torque)
+        sd = np.sqrt(np.diag(covariance))
+        if b > SURE * sd[0] and k > 0.0:
+            viscous = Estimate(float(b), float(sd[0]), "N·m·s/rad", "fit of K_t i_a = B_m ω + k_load ω²")
+            load = Estimate(float(k), float(sd[1]), load.unit, viscous.how)
+    numbers |= {"k_load": load, "B_m": viscous}
+    others = {"K_e in V/RPM": Estimate(constant.value * RPM, constant.sigma * RPM, "V/RPM", "K_e 2π/60",
+                                       constant.scatter * RPM)}
+    return Found(rows.name, len(v), numbers, others, (), (
+        Panel("back-EMF", "ω / rad/s", "v_a - R_a i_a / V", w, emf, lambda x: constant.value * x),
+        Panel("load", "ω / rad/s", "K_t i_a / N·m", w, torque, lambda x: viscous.value * x + load.value * x * x)))
+
+
+def duty_map(rows: Rows, base: Mapping[str, float]) -> Found:
+    """The duty map v = k0 + k1 sqrt(k2 τ + k3) (thesis 4.3), by least squares over the rows above its dead zone.
+
+    One of k1, k2, k3 only scales the others: k1 stays as it is in `base`.
+
+    Raises:
+        BenchTestError: columns or rows are missing, or no root goes through them.
+    """
+    duty, v, _, dv = rows.take("duty", "v_a", least=4)
+    if duty.min() < 0.0 or duty.max() > 1.0:
+        raise BenchTestError(f"{rows.name}: duty goes from {duty.min():g} to {duty.max():g}; give it as 0..1, or in %")
+    alive = v > SURE * dv
+    if np.unique(duty[alive]).size < 4:
+        raise BenchTestError(f"{rows.name}: {np.unique(duty[alive]).size} duties give a voltage; the map has three "
+                             "numbers, give at least 4")
+    k1 = base["k1"] or float(PARAMETERS["model.k1"].high) * 1e-4
+    x, y = duty[alive], v[alive]
+
+    def left(p: Array) -> Array:
+        return np.asarray(p[0] + np.sqrt(np.exp(p[1]) * x + np.exp(p[2])) - y)
+
+    starts = [(float(y.min()) - lift, math.log(max(float(np.ptp(y) + lift) ** 2, 1e-6)), math.log(max(lift**2, 1e-8)))
+              for lift in (0.03, 0.3, 3.0)]
+    fit = min((least_squares(left, s) for s in starts), key=lambda one: float(one.cost))
+    covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * 2.0 * fit.cost / max(len(x) - 3, 1)
+    sd = np.sqrt(np.diag(covariance))
+    k2, k3 = math.exp(fit.x[1]) / k1**2, math.exp(fit.x[2]) / k1**2
+    how = "least squares, k1 kept"
+    numbers = {"k0": Estimate(float(fit.x[0]), float(sd[0]), "V", how), "k1": Estimate(k1, 0.0, "V", "kept: a scale"),
+               "k2": Estimate(k2, k2 * float(sd[1]), "-", how), "k3": Estimate(k3, k3 * float(sd[2]), "-", how)}
+    for name, one in numbers.items():
+        p = PARAMETERS[f"model.{name}"]
+        if not p.low <= one.value <= p.high:
+            raise BenchTestError(f"{rows.name}: no map of the form k0 + k1 sqrt(k2 τ + k3) goes through its rows "
+                                 f"({name} = {one.value:.3g})")
+    values = {name: one.value for name, one in numbers.items()}
+    mse = Estimate(float(np.mean((actuator.voltage(values, x) - y) ** 2)), 0.0, "V²", "mean squared error")
+    dead = int((~alive).sum())
+    notes = (f"{dead} rows with no voltage were left out: the dead zone",) if dead else ()
+    return Found(rows.name, len(x), numbers, {"MSE": mse}, notes, (
+        Panel("duty map", "duty", "v_a / V", duty, v, lambda x: actuator.voltage(values, x)),))
+
+
+def thrust_curve(rows: Rows, numbers: Mapping[str, float]) -> Found:
+    """Thrust over the voltage (thesis 4.4), its inverse (4.5), and k_thrust = f/ω² with the exponent that fits best.
+
+    Args:
+        rows: thrust, or theta (the arm as its own scale: f = (mgd/L) sin θ); and omega, v_a or duty.
+        numbers: the model's numbers, with what other tests have found; they give the speed where it was not read.
+
+    Raises:
+        BenchTestError: columns or rows are missing, or no thrust was made.
+    """
+    notes: list[str] = []
+    columns, sigma = dict(rows.columns), dict(rows.sigma)
+    if "thrust" not in columns:
+        if "theta" not in columns:
+            raise BenchTestError(f"{rows.name}: neither thrust nor theta is in it; it has {', '.join(columns)}")
+        weight = numbers["mgd_over_J"] / numbers["L_over_J"]
+        columns["thrust"] = weight * np.sin(columns["theta"])
+        if "theta" in sigma:
+            sigma["thrust"] = weight * np.abs(np.cos(columns["theta"])) * sigma["theta"]
+        notes.append(f"the thrust is what holds the arm: as true as the model's mgd_over_J/L_over_J = {weight:.4g} N")
+    if "v_a" not in columns and "duty" in columns:
+        columns["v_a"] = actuator.voltage(numbers, columns["duty"])
+        notes.append("the voltage is what the model's duty map gives")
+    if "omega" not in columns and "v_a" in columns:
+        columns["omega"] = actuator.speed_at(numbers, columns["v_a"])
+        notes.append("the speed is what the model's motor reaches at that voltage")
+    every = Rows(rows.name, columns, sigma)
+    made = every.where(np.flatnonzero((columns["thrust"] > 0.0) & (columns.get("omega", columns["thrust"]) > 0.0)))
+    w, f, dw, df = made.take("omega", "thrust", least=4)
+    relative = np.hypot(df / f, 2.0 * dw / w)
+    k = mean_of(f / w**2, "N·s²/rad²", "mean of f/ω²", f / w**2 * relative)
+    x = np.log(w / np.exp(np.mean(np.log(w))))
+    weight_ = 1.0 / relative if (relative > 0.0).all() else np.ones(len(w))
+    (_, n), covariance = _lines(weight_[:, None] * np.column_stack([np.ones(len(x)), x]), weight_ * np.log(f),
+                                least=1.0 if (relative > 0.0).all() else 0.0)
+    exponent = Estimate(float(n), math.sqrt(covariance[1, 1]), "-", "slope of log f over log ω")
+    others = {"exponent of ω": exponent,
+              "K_q": Estimate(k.value / GEAR**2, k.sigma / GEAR**2, "N·s²/rad²", "k_thrust/(55/9)²: thesis (3.3)")}
+    if abs(exponent.value - 2.0) > SURE * exponent.sigma:
+        notes.append(f"the thrust grows with ω^{exponent.value:.3f} ± {exponent.sigma:.2g} rather than ω²")
+    panels = [Panel("thrust over speed", "ω / rad/s", "f / N", w, f, lambda x: k.value * x * x)]
+    if "v_a" in columns:
+        v, f, _, _ = every.take("v_a", "thrust", least=4)
+        p, spread = _lines(np.column_stack([v * v, v, np.ones(len(v))]), f)
+        for name, value, sd, unit in zip("abc", p.tolist(), np.sqrt(np.diag(spread)).tolist(), ("N/V²", "N/V", "N")):
+            others[f"{name} of f = a v² + b v + c"] = Estimate(value, sd, unit, "least squares")
+        panels.append(Panel("thrust over voltage", "v_a / V", "f / N", v, f, lambda x: np.asarray(np.polyval(p, x))))
+    return Found(rows.name, len(w), {"k_thrust": k}, others, tuple(notes), tuple(panels))
+
+
+def thrust_to_voltage(a: float, b: float, c: float) -> tuple[float, float, float, float]:
+    """The inverse of f = a v² + b v + c (thesis 4.4) as v = p + q sqrt(r + s f) (4.5): p, q, r, s.
+
+    Raises:
+        ValueError: a is not positive, so there is no such inverse.
+    """
+    if not a > 0.0:
+        raise ValueError(f"a = {a:g} N/V²: the inverse needs a thrust that grows ever faster")
+    return -b / (2.0 * a), 1.0 / (2.0 * a), b * b - 4.0 * a * c, 4.0 * a
+
+
+def plateaus(recording: Recording, channels: Sequence[str], name: str) -> Rows:
+    """The steady states of a recording: the mean of every channel over the last half of each hold of the duty.
+
+    A hold counts when it lasts `HOLD` and the two quarters of that half agree within their noise or `SETTLED`.
+
+    Raises:
+        BenchTestError: a channel was not measured, or fewer than three holds settled.
+    """
+    missing = [c for c in channels if c not in recording.channels]
+    if missing:
+        raise BenchTestError(f"{name}: {', '.join(missing)} was not measured")
+    starts, sizes = holds(recording.duty)
+    resolution = {c: _step(getattr(recording, c)) / math.sqrt(12.0) for c in channels}
+    rows: list[list[float]] = []
+    sigmas: list[list[float]] = []
+    unsettled = 0
+    for start, end in zip(starts.tolist(), (starts + sizes).tolist()):
+        if recording.t[end - 1] - recording.t[start] < HOLD:
+            continue
+        half = slice((start + end) // 2, end)
+        means, spreads, steady_ = [], [], True
+        for c in channels:
+            x = getattr(recording, c)
+            first, second = np.array_split(x[half], 2)
+            noise = math.hypot(float(np.nanstd(first)) / math.sqrt(len(first)), resolution[c])
+            close = max(SURE * math.sqrt(2.0) * noise, SETTLED * float(np.nanmax(x) - np.nanmin(x)))
+            steady_ &= bool(abs(np.nanmean(first) - np.nanmean(second)) <= close)
+            means.append(float(np.nanmean(x[half])))
+            spreads.append(math.hypot(float(np.nanstd(x[half])) / math.sqrt(end - half.start), resolution[c]))
+        unsettled += not steady_
+        if steady_:
+            rows.append(means)
+            sigmas.append(spreads)
+    if len(rows) < 3:
+        raise BenchTestError(f"{name}: {len(rows)} holds of the duty settle in {', '.join(channels)} ({unsettled} do "
+                             f"not); hold at least 3 duties, longer: excite --ros-args -p kind:=staircase "
+                             f"-p duration:=120.0")
+    table, spread = np.array(rows), np.array(sigmas)
+    return Rows(name, dict(zip(channels, table.T)), dict(zip(channels, spread.T)))
+
+
+def _step(x: Array) -> float:
+    """The resolution of readings: the least difference between two of them."""
+    values = np.unique(x[np.isfinite(x)])
+    return float(np.diff(values).min()) if len(values) > 1 else 0.0
+
+
+def _lines(terms: Array, y: Array, least: float = 0.0) -> tuple[Array, Array]:
+    """Linear least squares and its covariance; the variance of a row is what is left, or `least`."""
+    p = np.asarray(np.linalg.lstsq(terms, y, rcond=None)[0])
+    left = y - terms @ p
+    variance = max(float(left @ left) / max(len(y) - len(p), 1), least)
+    return p, np.linalg.inv(terms.T @ terms) * variance
+
+
+def _positive(rows: Rows, **columns: Array) -> None:
+    for name, x in columns.items():
+        if not (x > 0.0).all():
+            at = int(np.flatnonzero(~(x > 0.0))[0])
+            raise BenchTestError(f"{rows.name}: {name} = {x[at]:g} in row {at + 1}; leave out rows without a reading")

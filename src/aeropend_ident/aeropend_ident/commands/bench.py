@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bench tests of a rig: `bench_test --blocked-rotor pairs.csv --steady speeds.csv`.
+
+Works out the numbers of the motor and the propeller from tables or recordings, and writes a model file that says where
+each came from. Exit code 0 with numbers, 2 with one line on standard error when the input cannot be used.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from aeropend_ident.bags import recording
+from aeropend_ident.bags.recording import Recording, RecordingError
+from aeropend_ident.bench_tests import estimates
+from aeropend_ident.bench_tests.estimates import BenchTestError, Estimate, Found, Rows
+from aeropend_ident.bench_tests.table import read_rows
+from aeropend_ident.identification.picture import scatter
+from aeropend_ident.result_folder import OutputError, check, whole
+from aeropend_sim.cli.command import Parser, interruptible
+from aeropend_sim.model.parameters import PRESETS, Model, ModelError, from_flat, load, save
+
+FILES = ("bench.yaml", "bench_tests.json", "bench_tests.svg")
+
+TESTS = {
+    "blocked-rotor": "R_a, and from a recording L_a: v_a, i_a with the rotor blocked",
+    "current-step": "L_a: t, i_a (and v_a) after a step of the voltage with the rotor blocked",
+    "steady": "K_e, K_t, k_load, B_m: v_a, i_a, omega in steady states",
+    "duty-map": "k0 to k3: duty, v_a",
+    "thrust": "k_thrust: thrust (or theta: the arm weighs it), and omega, v_a or duty",
+}
+"""In the order in which they need each other, with what each gives and takes."""
+
+Source = Rows | Recording
+
+
+def work_out(sources: Mapping[str, Source], base: Model) -> dict[str, Found]:
+    """Run the bench tests on their sources, by the names of `TESTS`.
+
+    Args:
+        sources: a table or a recording for each test. base: gives the numbers that no test has found.
+
+    Raises:
+        BenchTestError: one of them cannot be worked out.
+    """
+    found: dict[str, Found] = {}
+
+    def numbers() -> dict[str, float]:
+        return {**base.numbers(), **{k: e.value for one in found.values() for k, e in one.numbers.items()}}
+
+    def known(name: str) -> Estimate:
+        for one in found.values():
+            if name in one.numbers:
+                return one.numbers[name]
+        return Estimate(base.model[name], 0.0, "", f"of {base.name}")
+
+    def rows(source: Source, *channels: str) -> Rows:
+        if isinstance(source, Rows):
+            return source
+        settled = estimates.plateaus(source, channels, source.path)
+        return settled.where(np.flatnonzero(settled.columns["omega"] > 0.0)) if "omega" in channels else settled
+
+    def blocked(source: Source) -> Found:
+        if isinstance(source, Rows):
+            return estimates.blocked_rotor(source)
+        return estimates.blocked_recording(source, source.path)
+
+    def step(source: Source) -> Found:
+        if isinstance(source, Rows):
+            return estimates.current_step(source, known("R_a"))
+        raise BenchTestError(f"{source.path}: a recording with the rotor blocked goes to --blocked-rotor, which gives "
+                             "L_a as well")
+
+    run: dict[str, Callable[[Source], Found]] = {
+        "blocked-rotor": blocked,
+        "current-step": step,
+        "steady": lambda s: estimates.steady(rows(s, "v_a", "i_a", "omega"), known("R_a")),
+        "duty-map": lambda s: estimates.duty_map(rows(s, "duty", "v_a"), base.model),
+        "thrust": lambda s: estimates.thrust_curve(rows(s, "theta", "omega", "v_a"), numbers()),
+    }
+    for name, test in run.items():
+        if name in sources:
+            one = test(sources[name])
+            found[name] = replace(one, notes=(*sources[name].notes, *one.notes))
+    return found
+
+
+def augmented(base: Model, found: Mapping[str, Found]) -> Model:
+    """The base with what was found.
+
+    Raises:
+        ModelError: a number is out of range.
+    """
+    flat = {f"model.{k}": e.value for one in found.values() for k, e in one.numbers.items()}
+    return from_flat(flat, "what the bench tests gave", base)
+
+
+def provenance(base: Model, found: Mapping[str, Found], command: str) -> str:
+    """Where every number of the model file comes from."""
+    lines = [command, ""]
+    for test, one in found.items():
+        lines += [f"{k} = {value(e)}: {test} of {one.source}, {one.rows} rows, {e.how}" for k, e in one.numbers.items()]
+    return "\n".join([*lines, f"all others: {base.name}"])
+
+
+def value(e: Estimate) -> str:
+    """A number with its standard deviation and unit."""
+    unit = "" if e.unit == "-" else f" {e.unit}"
+    return f"{e.value:.5g} ± {e.sigma:.2g}{unit}" if e.sigma > 0.0 else f"{e.value:.5g}{unit}"
+
+
+def lines(found: Mapping[str, Found]) -> list[str]:
+    """What was found, for a person."""
+    out = []
+    for test, one in found.items():
+        out.append(f"{test} ({one.source}, {one.rows} rows)")
+        for name, e in {**one.numbers, **one.others}.items():
+            scatter_ = "" if math.isnan(e.scatter) else f", {e.scatter:.2g} a row"
+            out.append(f"  {name} = {value(e)}   ({e.how}{scatter_})")
+        if "a of f = a v² + b v + c" in one.others:
+            a, b, c = (one.others[f"{k} of f = a v² + b v + c"].value for k in "abc")
+            if a > 0.0:
+                p, q, r, s = estimates.thrust_to_voltage(a, b, c)
+                out.append(f"  inverse: v = {p:.5g} + {q:.5g} sqrt({r:.5g} + {s:.5g} f)")
+        out += [f"  note: {note}" for note in one.notes]
+    return out
+
+
+def document(found: Mapping[str, Found]) -> dict[str, object]:
+    """The content of `bench_tests.json`."""
+
+    def told(e: Estimate) -> dict[str, object]:
+        return {"value": e.value, "sigma": e.sigma, "unit": e.unit, "how": e.how,
+                "scatter": None if math.isnan(e.scatter) else e.scatter}
+
+    return {"format": 1, **{test: {"source": one.source, "rows": one.rows, "notes": list(one.notes),
+                                   "numbers": {k: told(e) for k, e in one.numbers.items()},
+                                   "others": {k: told(e) for k, e in one.others.items()}}
+                            for test, one in found.items()}}
+
+
+EXAMPLES = """tables: CSV with a line of names and units, as in 'v_a [V],i_a [A],omega [rpm]'; quantities: t, v_a, i_a,
+omega, duty, thrust, theta. A recording (folder, .mcap or .db3) gives its steady states.
+
+examples:
+  bench_test --blocked-rotor pairs.csv --steady speeds.csv --out my_bench
+  bench_test --blocked-rotor blocked_bag --steady stairs_bag --duty-map stairs_bag --thrust stairs_bag
+  bench_test --thrust scale.tsv --columns 'v_a [V],thrust [N]'      a table without names
+
+exit codes: 0 numbers were written, 2 the input cannot be used (one line says why), 130 interrupted"""
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Read the command line; exits with 2 and one line where it is wrong."""
+    parser = Parser(prog="bench_test", epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
+                    description="Work out the numbers of motor and propeller from bench tests.")
+    for name, about in TESTS.items():
+        parser.add_argument(f"--{name}", metavar="TABLE|BAG", help=about)
+    parser.add_argument("--columns", metavar="NAMES", help="names and units of the columns of tables without a line of "
+                        "names")
+    parser.add_argument("--model", default="bench", metavar="PRESET|FILE",
+                        help=f"gives what no test finds: {' or '.join(PRESETS)}, or a model file (default: bench)")
+    parser.add_argument("--namespace", metavar="NS", help="namespace of the rig, when a bag holds several")
+    parser.add_argument("--out", default="bench_test", metavar="DIR",
+                        help="folder for the results (default: bench_test)")
+    parser.add_argument("--overwrite", action="store_true", help="replace results that are in the folder already")
+    options = parser.parse_args(arguments)
+    if not any(getattr(options, name.replace("-", "_")) for name in TESTS):
+        parser.error(f"name at least one test: {', '.join(f'--{name}' for name in TESTS)}")
+    return options
+
+
+def source(path: str, columns: str | None, namespace: str | None) -> Source:
+    """Read a table, or a recording: a folder, .mcap or .db3.
+
+    Raises:
+        BenchTestError, RecordingError: it cannot be used.
+    """
+    if Path(path).is_dir() or Path(path).suffix in {".mcap", ".db3"}:
+        read = recording.read(path, namespace)
+        return replace(read, path=Path(path).name)
+    return read_rows(Path(path), columns)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Work everything out and write the results.
+
+    Raises:
+        BenchTestError, RecordingError, ModelError, OutputError: the input or the output cannot be used.
+    """
+    out = Path(options.out)
+    check(out, FILES, overwrite=options.overwrite)
+    base = load(options.model)
+    given = {name: getattr(options, name.replace("-", "_")) for name in TESTS}
+    read = {path: source(path, options.columns, options.namespace) for path in set(given.values()) if path}
+    found = work_out({name: read[path] for name, path in given.items() if path}, base)
+    model = augmented(base, found)
+    command = "bench_test " + " ".join(f"--{name} {Path(path).name}" for name, path in given.items() if path)
+    with whole(out, FILES) as place:
+        save(model, place / FILES[0], provenance(base, found, command))
+        body = json.dumps(document(found), indent=1, ensure_ascii=False, allow_nan=False)
+        (place / FILES[1]).write_text(body + "\n", encoding="utf-8", errors="backslashreplace")
+        (place / FILES[2]).write_text(scatter([p for one in found.values() for p in one.panels]), encoding="utf-8")
+    print("\n".join(lines(found)))
+    print("   ".join(str(out / name) for name in FILES))
+
+
+@interruptible
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit code."""
+    options = parse(arguments)
+    try:
+        run(options)
+    except (BenchTestError, RecordingError, ModelError, OutputError) as error:
+        print(f"bench_test: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The main job from end to end: a plant with a hidden effect, a recording of it, and what `diagnose` makes of that.
+
+The plant, the excitation, the recorder and the diagnosis are processes of their own. What the plant is given is drawn
+at random and written to a file that the plant alone is told of.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from aeropend_sim.cli.command import Parser
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import Model, load, save
+
+NUMBER_ERROR = 0.03
+"""Each number of the plant is off from the model by up to this share: no model's numbers are exact."""
+
+STARTUP = 30.0
+"""s that processes may take to find each other."""
+
+MODULES = {"plant": "aeropend_sim.nodes.plant", "excite": "aeropend_control.nodes.excite",
+           "record": "aeropend_ident.nodes.record", "diagnose": "aeropend_ident.commands.diagnose"}
+
+
+class DemoError(RuntimeError):
+    """The demo cannot go on; the message is one line for a person."""
+
+
+def draw(effect: str | None, seed: int | None) -> tuple[str, Model]:
+    """A rig: `bench` with numbers a little off and one effect of the catalogue, both by chance.
+
+    Args:
+        effect: pins the effect's id, or `none`. seed: pins all chance.
+
+    Returns:
+        The effect's id and the rig's model.
+    """
+    rng = np.random.default_rng(seed)
+    bench = load("bench")
+    numbers = {k: v * (1.0 + NUMBER_ERROR * rng.uniform(-1.0, 1.0)) for k, v in bench.model.items()}
+    drawn = effect or str(rng.choice(list(CATALOGUE)))
+    effects = {}
+    if drawn != "none":
+        entry = CATALOGUE[drawn]
+        effects[drawn] = {k: p.default for k, p in entry.parameters.items()}
+        p = entry.parameters[entry.size]
+        effects[drawn][entry.size] = p.neutral + (p.default - p.neutral) * float(rng.uniform(0.8, 1.5))
+    return drawn, Model("rig", numbers, bench.sensing, effects)
+
+
+@contextmanager
+def process(name: str, *arguments: str, environment: dict[str, str], log: Path) -> Iterator[subprocess.Popen[str]]:
+    """A program of ours, its output in a file; stopped when the block is left, whatever happens."""
+    with log.open("w", encoding="utf-8") as file:
+        child = subprocess.Popen([sys.executable, "-m", MODULES[name], *arguments], env=environment, stdout=file,
+                                 stderr=subprocess.STDOUT, text=True, start_new_session=True)
+        try:
+            yield child
+        finally:
+            for number, patience in ((signal.SIGINT, 10.0), (signal.SIGKILL, 5.0)):
+                if child.poll() is None:
+                    child.send_signal(number)
+                    try:
+                        child.wait(patience)
+                    except subprocess.TimeoutExpired:
+                        continue
+
+
+def _check(name: str, child: subprocess.Popen[str], log: Path) -> None:
+    if child.poll() not in (None, 0):
+        lines = log.read_text(encoding="utf-8").strip().splitlines()
+        raise DemoError(f"{name} ended with {child.returncode}: {lines[-1] if lines else 'no output'} (see {log})")
+
+
+def measure(folder: Path, rig: Path, duration: float, seed: int, console: Console) -> Path:
+    """Run the plant, excite it and record it, for `duration` seconds; returns the recording."""
+    bag = folder / "recording"
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    environment.setdefault("ROS_DOMAIN_ID", str(os.getpid() % 100 + 1))
+    logs = {name: folder / f"{name}.log" for name in MODULES}
+
+    def start(name: str, *arguments: str):  # type: ignore[no-untyped-def]
+        return process(name, *arguments, environment=environment, log=logs[name])
+
+    with (
+        Progress(TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), console=console) as bar,
+        start("plant", "--ros-args", "--params-file", str(rig), "-p", f"seed:={seed}") as plant,
+        start("record", str(bag), "--ros-args", "-p", "while_published:=duty_command") as record,
+        start("excite", "--ros-args", "-p", f"duration:={duration}", "-p", f"seed:={seed}") as excite,
+    ):
+        running = {"plant": plant, "record": record, "excite": excite}
+        task = bar.add_task("plant, excite and record are running", total=duration)
+        begun = time.monotonic()
+        while record.poll() is None:
+            for name, child in running.items():
+                _check(name, child, logs[name])
+            passed = time.monotonic() - begun
+            if passed > duration + STARTUP:
+                raise DemoError(f"the recording did not end {STARTUP:g} s after it should have (see {logs['record']})")
+            bar.update(task, completed=min(passed, duration))
+            time.sleep(0.1)
+        bar.update(task, completed=duration)
+        for name, child in running.items():
+            _check(name, child, logs[name])
+    return bag
+
+
+def diagnose(folder: Path, bag: Path) -> dict[str, object]:
+    """Run `diagnose` on the recording; returns the content of diagnosis.json."""
+    result = subprocess.run([sys.executable, "-m", MODULES["diagnose"], str(bag), "--out", str(folder / "diagnosis")],
+                            check=False)
+    if result.returncode:
+        raise DemoError(f"diagnose ended with {result.returncode}")
+    content = json.loads((folder / "diagnosis" / "diagnosis.json").read_text(encoding="utf-8"))
+    assert isinstance(content, dict)
+    return content
+
+
+def is_right(drawn: str, which: dict[str, object]) -> bool:
+    """Whether the verdict names what was drawn, first."""
+    return which["verdict"] == drawn
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = Parser(prog="demo", description=__doc__.splitlines()[0],
+                    epilog="examples:\n  demo\n  demo --effect coulomb_friction\n\n"
+                           "exit codes: 0 right verdict, 1 wrong verdict, 2 it could not run, 130 interrupted",
+                    formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--effect", choices=[*CATALOGUE, "none"], metavar="ID",
+                        help="pin the hidden effect: " + ", ".join([*CATALOGUE, "none"]))
+    parser.add_argument("--duration", type=float, default=60.0, metavar="S", help="seconds to record (default: 60)")
+    parser.add_argument("--seed", type=int, help="pin all chance (default: a new draw each time)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for everything (default: demo-results/<time>)")
+    options = parser.parse_args(arguments)
+    if not (math.isfinite(options.duration) and 10.0 <= options.duration <= 600.0):
+        parser.error(f"--duration {options.duration:g}: give 10 to 600 seconds")
+    return options
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the demo; returns the exit code."""
+    options = _parse(arguments)
+    console = Console(stderr=True)
+    folder = options.out or Path("demo-results") / datetime.now().strftime("%Y%m%d-%H%M%S")
+    signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        print(f"demo: {folder}: {error.strerror}; give a new folder with --out", file=sys.stderr)
+        return 2
+    try:
+        drawn, rig = draw(options.effect, options.seed)
+        save(rig, folder / "rig.yaml", "the rig of the demo: what diagnose is not told")
+        seed = options.seed if options.seed is not None else int(np.random.default_rng().integers(1000))
+        print(f"A rig whose flaw is hidden runs for {options.duration:g} s and is recorded; results go to {folder}")
+        bag = measure(folder, folder / "rig.yaml", options.duration, seed, console)
+        content = diagnose(folder, bag)
+    except DemoError as error:
+        print(f"demo: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("demo: interrupted; every process was stopped", file=sys.stderr)
+        return 130
+    which = content["which"]
+    assert isinstance(which, dict)
+    right = is_right(drawn, which)
+    truth = ", ".join(f"{k} = {v:.4g}" for p in rig.effects.values() for k, v in p.items())
+    hidden = f"{drawn} ({truth})" if truth else drawn
+    print(f"hidden in the plant: {hidden}: the verdict is {'right' if right else 'WRONG'}")
+    return 0 if right else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

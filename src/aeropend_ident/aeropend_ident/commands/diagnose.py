@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command `diagnose`: recordings in, verdict out.
+
+Exit code 0 with a verdict, 2 with one line on standard error when the input cannot be used.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from aeropend_ident.bags.recording import RecordingError
+from aeropend_ident.diagnosis import batch
+from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.results import FILES, Results, document
+from aeropend_ident.diagnosis.validation import across
+from aeropend_ident.result_folder import OutputError, check
+from aeropend_ident.signals.from_bag import signals_of
+from aeropend_sim.cli.command import Parser, between, own
+from aeropend_sim.cli.progress import progress
+from aeropend_sim.model.parameters import PRESETS, ModelError, load
+from aeropend_sim.untrusted import printable
+
+EXAMPLES = """examples:
+  diagnose my_bag                                compare a recording with the preset 'bench'
+  diagnose monday tuesday --model rig.yaml       several recordings of one rig, fitted together
+  diagnose monday --test tuesday                 fit on one recording, show on another how far the gap closes
+  diagnose --each rigs/* --out verdicts          a rig of its own each: one verdict a recording, and a table
+  diagnose --each rigs/* --dask tcp://host:8786  the same on a Dask cluster (pip install 'aeropend_ident[dask]')
+  diagnose let_go --fit-nominal                  a rig whose numbers nobody knows, even without its command
+  diagnose my_bag --out verdict --jobs 2         choose the folder and the number of threads
+  plant --ros-args --params-file verdict/augmented.yaml      run the model with what was found
+
+exit codes: 0 a verdict was written, 2 the input cannot be used (one line says why), 130 interrupted"""
+
+
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """Read the command line; exits with 2 and one line where it is wrong."""
+    parser = Parser(
+        prog="diagnose", epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Compare recordings of a rig with its model: where they part, which effect the model is missing, "
+                    "and how far the gap closes once it is added.")
+    parser.add_argument("bags", nargs="+", metavar="BAG",
+                        help="a recording (folder, .mcap or .db3); several are of one rig, unless --each")
+    parser.add_argument("--each", action="store_true",
+                        help="each recording is of a rig of its own: one verdict each in DIR/<name of the bag>, "
+                             f"and a table in DIR/{batch.SUMMARY}")
+    parser.add_argument("--model", default="bench", metavar="PRESET|FILE",
+                        help=f"nominal model: {' or '.join(PRESETS)}, or a model file (default: bench)")
+    parser.add_argument("--out", metavar="DIR",
+                        help="folder for the results (default: diagnosis_<name of the bag>; with --each: diagnoses)")
+    parser.add_argument("--namespace", metavar="NS", help="namespace of the rig, when a bag holds several")
+    parser.add_argument("--held-out", type=between(0.05, 0.8, "a share"), default=0.3, metavar="SHARE",
+                        help="share at the end of each recording kept for testing (default: 0.3)")
+    parser.add_argument("--test", action="append", default=[], metavar="BAG",
+                        help="a further recording of the rig that nothing is fitted to: how far the gap closes there "
+                             "is told as well; may be given several times")
+    parser.add_argument("--jobs", type=_jobs, metavar="N",
+                        help="threads, or with --each processes (default: one a core); no verdict depends on it")
+    parser.add_argument("--dask", metavar="ADDRESS",
+                        help="with --each: let the workers of a Dask cluster do it, whose scheduler is there")
+    parser.add_argument("--fit-nominal", action="store_true",
+                        help="nobody knows the rig: identify its nominal model from the recordings first, as far as "
+                             "they tell; the command may be missing if the arm swings freely")
+    parser.add_argument("--overwrite", action="store_true", help="replace results that are in the folder already")
+    options = parser.parse_args(arguments)
+    if options.dask is not None and not options.each:
+        parser.error("--dask spreads recordings of different rigs: give --each with it")
+    if options.dask is not None and options.jobs is not None:
+        parser.error("--dask takes the workers that the cluster has: leave --jobs away")
+    if options.test and options.each:
+        parser.error("--test shows on a recording what others of the same rig said: leave --each away")
+    for bag in options.test:
+        if Path(bag).resolve() in {Path(fitted).resolve() for fitted in options.bags}:
+            parser.error(f"--test {bag}: that recording is fitted to; give it once, before or after --test")
+    options.jobs = options.jobs or os.cpu_count() or 1
+    return options
+
+
+def _jobs(text: str) -> int:
+    if not text.isdigit() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of threads from 1 on")
+    return int(text)
+
+
+def run(options: argparse.Namespace, command: str) -> None:
+    """Diagnose recordings of one rig together and write the results.
+
+    Raises:
+        RecordingError, ModelError, OutputError: the input or the output cannot be used.
+    """
+    started = time.monotonic()
+    out = Path(options.out or f"diagnosis_{batch.names(options.bags[:1])[0]}")
+    check(out, FILES, overwrite=options.overwrite)
+    model = load(options.model)
+    with progress("reading") as show:
+        signals, tests = ([signals_of(bag, options.namespace, model.sensing, options.held_out,
+                                      fit_nominal=options.fit_nominal) for bag in bags]
+                          for bags in (options.bags, options.test))
+        found = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal,
+                         progress=lambda what, share: show(share, what))
+        shown = [{"bag": bag, **across(found.model, found.augmented, s)} for bag, s in zip(options.test, tests)]
+        body = document(found, options.bags, options.model, time.monotonic() - started, shown)
+        results = Results.of(found, body, command)
+    results.write(out, overwrite=options.overwrite)
+    print("\n".join(results.lines))
+    print(printable(f"{out / 'report.html'}   {out / 'augmented.yaml'}   {body['seconds']} s"))
+
+
+def run_each(options: argparse.Namespace) -> int:
+    """Diagnose recordings of a rig each, write what is found as it comes, and a table of it; returns the exit code.
+
+    Raises:
+        ModelError, OutputError, ClusterError: none can be diagnosed.
+    """
+    started = time.monotonic()
+    out = Path(options.out or "diagnoses")
+    names = batch.names(options.bags)
+    check(out, (batch.SUMMARY,), overwrite=options.overwrite)
+    for name in names:
+        check(out / name, FILES, overwrite=options.overwrite)
+    settings = batch.Settings(load(options.model), options.model, options.namespace, options.held_out,
+                             options.fit_nominal)
+    commands = [_alone(options, bag, out / name) for bag, name in zip(options.bags, names)]
+    rows = []
+    try:
+        with (batch.cluster(options.dask) as client, progress(f"0 of {len(names)} recordings", len(names)) as show,
+              closing(batch.diagnose_each(options.bags, commands, settings, options.jobs, client)) as outcomes):
+            for name, outcome in zip(names, outcomes):
+                if outcome.results is not None:
+                    outcome.results.write(out / name, overwrite=options.overwrite)
+                rows.append(batch.row(outcome, name))
+                show(len(rows), f"{len(rows)} of {len(names)} recordings")
+    except KeyboardInterrupt:
+        done = sum((out / name / "diagnosis.json").exists() for name in names)
+        raise Interrupted(f"interrupted; {done} of {len(names)} verdicts are in {out}" if done else
+                          "interrupted, nothing written") from None
+    batch.write_summary(out, rows)
+    print_table(rows)
+    refused = sum(bool(row["error"]) for row in rows)
+    if refused == len(rows) == 1:
+        print(f"diagnose: {rows[0]['error']}", file=sys.stderr)
+        return 2
+    if refused == len(rows):
+        print(f"diagnose: none of the {refused} recordings can be used; {out / batch.SUMMARY} says why",
+              file=sys.stderr)
+        return 2
+    print(printable(f"{len(rows) - refused} of {len(rows)} diagnosed   {out / batch.SUMMARY}   "
+                    f"{time.monotonic() - started:.1f} s"))
+    return 0
+
+
+def _alone(options: argparse.Namespace, bag: str, out: Path) -> str:
+    """The command that gives the verdict of one of many recordings by itself."""
+    words = ["diagnose", bag, "--out", str(out), "--model", options.model, "--held-out", f"{options.held_out:g}"]
+    words += ["--namespace", options.namespace] if options.namespace is not None else []
+    return shlex.join(words + ["--fit-nominal"] * options.fit_nominal)
+
+
+def print_table(rows: Sequence[dict[str, object]]) -> None:
+    """The summary for a person, on standard output; as wide as it needs to be where that is no terminal."""
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=10_000)
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for heading in ("recording", "verdict", "place", "effects", "gap closed"):
+        table.add_column(heading, overflow="fold")
+    table.add_column("s", justify="right")
+    for row in rows:
+        if row["error"]:
+            table.add_row(_cell(row["recording"]), "cannot tell", "", _cell(row["error"]))
+        else:
+            closed = "nothing to close" if row["closed"] == "" else f"{100.0 * float(str(row['closed'])):.0f} %"
+            table.add_row(_cell(row["recording"]), str(row["verdict"]), str(row["place"]), str(row["effects"]), closed,
+                          f"{row['seconds']:.1f}")
+    console.print(table)
+
+
+def _cell(text: object) -> str:
+    """What a name says, not what it would do."""
+    return escape(printable(str(text)))
+
+
+class Interrupted(Exception):  # noqa: N818
+    """Ctrl-C; the message says what was done until then."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit code."""
+    arguments = own(arguments)
+    options = parse(arguments)
+    try:
+        if options.each:
+            return run_each(options)
+        run(options, shlex.join(["diagnose", *arguments]))
+    except (RecordingError, ModelError, OutputError, batch.ClusterError) as error:
+        print(f"diagnose: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("diagnose: interrupted, nothing written", file=sys.stderr)
+        return 130
+    except Interrupted as error:
+        print(f"diagnose: {error}", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How well an input excites a rig: what a recording of it could tell, before one is spent on it.
+
+    excitation_quality --model bench --duration 20 --duty-max 0.3       a planned signal
+    excitation_quality my_bag --model bench                             a recording
+
+The model says what the rig would do; the Fisher information of the readings says how well each coefficient of its
+equations would be known, and which other terms of the library would explain the same readings (collinearity).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from aeropend_ident.bags import recording
+from aeropend_ident.bags.recording import RecordingError
+from aeropend_ident.identification import dataset
+from aeropend_ident.identification.dataset import Dataset
+from aeropend_ident.identification.discrepancy import in_library
+from aeropend_ident.identification.identify import Problem
+from aeropend_ident.identification.output_error import Entries, Fitter
+from aeropend_ident.identification.output_error_selection import alternatives, linearise
+from aeropend_ident.identification.terms import Array, thesis_terms
+from aeropend_sim.cli.command import EXIT_CODES, Parser, interruptible
+from aeropend_sim.cli.progress import Show, nothing, progress
+from aeropend_sim.model.excitation import KINDS, Excitation
+from aeropend_sim.model.parameters import PRESETS, SAMPLE_PERIOD, Model, ModelError, load
+from aeropend_sim.model.rig import record
+
+EXAMPLES = f"""examples:
+  excitation_quality --duration 20 --duty-max 0.3        a signal of `excite`, before a recording is spent on it
+  excitation_quality --kind steps --model my_rig.yaml
+  excitation_quality my_bag                              a recording
+
+{EXIT_CODES}"""
+
+SIGNAL = {"duration": "length, s", "duty_min": "least duty", "duty_max": "greatest duty",
+          "hold_min": "shortest hold, s", "hold_max": "longest hold, s", "rest": "duty 0 between the holds, s"}
+
+POOR = 0.1
+"""Relative 1 sigma of a coefficient from which on an input excites it poorly."""
+
+
+@dataclass(frozen=True)
+class Excited:
+    """How well one term of one equation would be known.
+
+    Attributes:
+        equation, term, value: the coefficient. sigma: 1 sigma that the readings would leave.
+        rivals: terms that the readings could not tell from it.
+    """
+
+    equation: str
+    term: str
+    value: float
+    sigma: float
+    rivals: tuple[str, ...]
+
+    @property
+    def poor(self) -> bool:
+        """Whether the input excites it poorly."""
+        return bool(self.rivals) or not self.sigma < POOR * abs(self.value)
+
+
+def planned(model: Model, duty: Array, seed: int = 0) -> Dataset:
+    """What a rig like the model would give for duties (N,), one a sample period.
+
+    Raises:
+        RecordingError: nothing would happen.
+    """
+    read, _ = record(model, duty, seed)
+    return dataset.from_readings({**read, "duty": duty}, SAMPLE_PERIOD, model.sensing, held_out=0.0,
+                                 name="the planned input")
+
+
+def quality(model: Model, data: Dataset, show: Show = nothing) -> list[Excited]:
+    """How well the coefficients of a model's equations are excited in a dataset.
+
+    Args:
+        model: without effects. data: its readings. show: is told which share of the work is done, about.
+
+    Raises:
+        RecordingError: the model does not run on it. ModelError: the model has effects.
+    """
+    true = in_library(model)
+    names = thesis_terms(data.variables)
+    problem = Problem(data, names, None)
+    matrix = np.zeros((len(data.states), len(names)))
+    for k, s in enumerate(data.states):
+        if k not in problem.exact:
+            matrix[k] = [true[s].get(t, 0.0) for t in names]
+    start = problem.fill(matrix)
+    fitter = Fitter(problem.experiment(len(data)), Entries.of(start), 0, floor=1.0)
+    equation, term = np.nonzero(problem.candidates)
+    every = Entries(equation.astype(np.int64), term.astype(np.int64), np.zeros(len(term)))
+    if fitter.run(*fitter.point) is None:
+        raise RecordingError(f"{data.name}: the model runs away on it, so nothing can be said; check the model file")
+    show(0.1, "fitting the readings")
+    fitter.fit(rounds=5)
+    show(0.5, "weighing every term")
+    linear, now, _ = linearise(fitter, every, start.shape)
+    sigma = np.sqrt(np.diag(fitter.covariance()))
+    rivals = list(alternatives(linear, every, now))
+    found = []
+    for k, (e, t) in enumerate(zip(fitter.model.equation.tolist(), fitter.model.term.tolist())):
+        other = tuple(names[b] for f, a, b, _ in rivals if (f, a) == (e, t))
+        found.append(Excited(data.states[e], names[t], float(start[e, t]), float(sigma[k]), other))
+    return found
+
+
+@interruptible
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit code."""
+    parser = Parser(prog="excitation_quality", epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
+                    description="How well a planned or recorded input excites each term.")
+    parser.add_argument("bag", nargs="?", metavar="BAG",
+                        help="a recording; without it, a signal of `excite` is planned")
+    parser.add_argument("--model", default="bench", metavar="PRESET|FILE",
+                        help=f"{' or '.join(PRESETS)}, or a model file (default: bench)")
+    parser.add_argument("--namespace", metavar="NS", help="namespace of the rig, when a bag holds several")
+    plan = Excitation()
+    parser.add_argument("--kind", choices=KINDS, default=plan.kind,
+                        help="the signal, as of `excite`; default %(default)s")
+    for name, meaning in SIGNAL.items():
+        parser.add_argument(f"--{name.replace('_', '-')}", type=float, default=getattr(plan, name), metavar="X",
+                            help=f"{meaning}; default %(default)s")
+    parser.add_argument("--seed", type=int, default=plan.seed, help="of the signal and the noise; default %(default)s")
+    options = parser.parse_args(arguments)
+    try:
+        model = load(options.model)
+        with progress("reading") as show:
+            if options.bag:
+                data = dataset.from_bag(recording.read(options.bag, options.namespace), model.sensing, held_out=0.0)
+            else:
+                signal = Excitation(options.kind, options.duration, options.seed, options.duty_min, options.duty_max,
+                                    options.hold_min, options.hold_max, rest=options.rest)
+                data = planned(model, signal.series())
+            found = quality(model, data, show)
+    except (RecordingError, ModelError, ValueError) as error:
+        print(f"excitation_quality: {error}", file=sys.stderr)
+        return 2
+    for one in found:
+        said = f"cannot be told from {', '.join(one.rivals)}" if one.rivals else ("poorly excited" if one.poor else "")
+        known = f"known to {100.0 * one.sigma / abs(one.value):8.3g} %"
+        print(f"d({one.equation})/dt  {one.term:18} {one.value:12.6g}  {known}  {said}".rstrip())
+    poor = sum(one.poor for one in found)
+    print(f"{poor} of {len(found)} terms would stay undetermined" if poor else "every term is excited")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

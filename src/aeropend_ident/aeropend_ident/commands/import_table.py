@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Makes a recording of a table: `import run.csv my_bag --time t:ms --theta angle:deg --duty pwm:%`.
+
+Without options that say what the columns are, it shows the table and proposes them; a proposal is taken only with
+--accept. Exit code 0 with a recording, 2 with one line on standard error when the table cannot be used.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table as Shown
+
+from aeropend_ident.tables import files
+from aeropend_ident.tables.clock import CLOCKS
+from aeropend_ident.tables.guess import Guess, guess, is_obvious, option, options
+from aeropend_ident.tables.mapping import Plan, Samples, no_time, samples
+from aeropend_ident.tables.table import Table, TableError, many
+from aeropend_ident.tables.units import UNITS, told
+from aeropend_ident.tables.write import BagExistsError, write
+from aeropend_sim.cli.command import EXIT_CODES, Parser, between, interruptible, own
+from aeropend_sim.cli.progress import progress
+from aeropend_sim.untrusted import one_line, printable
+
+DELIMITERS = {"tab": "\t", "blank": " ", "blanks": " ", "space": " ", "\\t": "\t"}
+
+EXAMPLES = f"""\
+examples:
+  import run.csv                                      show the columns, and propose what they are
+  import run.csv my_bag --accept                      take the proposal
+  import run.csv my_bag --time "t [ms]:ms" --theta angle:deg --duty pwm:counts:255
+  import fall.csv my_bag --time 1:s --theta 2:deg --zero end --motor-off
+  import day1.xlsx day2.xlsx bags --sheet Data --time 1:s --theta 2:deg --duty 3:%
+  import adc.npy my_bag --rate 490 --theta 1:counts:1024 --zero 512 --flip
+
+A column is named as the file names it, or by its number from 1 on. A unit may have a size: `--theta pot:54deg` where
+one volt is 54 degrees, `--current adc:-4.9mA`. Several files become a recording each, in the folder named last.
+
+{EXIT_CODES}"""
+
+
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """Read the command line; exits with 2 and one line where it is wrong."""
+    parser = Parser(
+        prog="import", usage="import FILE [FILE ...] BAG [--time COLUMN:UNIT] [--theta COLUMN:UNIT] [options]",
+        epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Make a recording of a table: CSV, TSV, text, Excel (.xlsx), MATLAB (.mat) or NumPy (.npy, .npz). "
+                    "Clocks that are late, rounded,\nrepeated or wrapped are repaired, and what was done is told.")
+    parser.add_argument("paths", nargs="+", metavar="FILE",
+                        help="the table, and last the recording to make (BAG); with several, a folder for theirs")
+    columns = parser.add_argument_group("what the columns are (COLUMN or COLUMN:UNIT)")
+    about = {"time": "when the row was measured", "theta": "angle of the arm", "duty": "duty applied",
+             "omega": "speed of the rotor", "current": "current of the motor", "voltage": "voltage at the motor",
+             "reference": "what the arm (or the rotor) was to reach"}
+    for quantity in UNITS:
+        columns.add_argument(f"--{quantity}", metavar="COLUMN:UNIT",
+                             help=f"{about[quantity]}: {told(quantity)}".replace("%", "%%"))
+    columns.add_argument("--accept", action="store_true", help="take what is proposed for the columns")
+    more = parser.add_argument_group("what the table does not say")
+    more.add_argument("--rate", type=between(0.1, 1e6, "a rate", "Hz"), metavar="HZ",
+                      help="the rows are evenly spaced, so many a second")
+    more.add_argument("--zero", metavar="READING",
+                      help="what --theta reads when the arm hangs: -83deg, or a number in its unit, or `start` or "
+                           "`end` where it hangs at rest there; default 0")
+    more.add_argument("--flip", action="store_true", help="--theta falls when the arm is lifted")
+    more.add_argument("--motor-off", action="store_true", help="the duty was 0 all the time, as in a free swing")
+    more.add_argument("--clock", choices=CLOCKS, default="auto",
+                      help="even: the rows are evenly spaced, whatever their stamps; stamps: every stamp is right; "
+                           "auto finds out and says why")
+    more.add_argument("--sheet", metavar="NAME", help="of a workbook that holds several tables")
+    more.add_argument("--delimiter", type=_delimiter, metavar="MARK", help="between cells: , ; tab blank or another")
+    more.add_argument("--decimal", choices=(".", ","), metavar="MARK", help="of decimals: . or ,")
+    more.add_argument("--skip-bad", action="store_true", help="leave out rows that cannot be read")
+    given = parser.parse_args(_joined(arguments))
+    given.files, given.bag = [Path(path) for path in given.paths], None
+    if len(given.paths) > 1:
+        *given.files, given.bag = given.files
+        if given.bag.is_file():
+            parser.error(f"{given.bag} is a file: name the recording to make last")
+        stems = [file.stem for file in given.files]
+        same = next((stem for stem in stems if stems.count(stem) > 1), None)
+        if same:
+            parser.error(f"two files are called {same}: import them one by one")
+    if given.motor_off and given.duty:
+        parser.error("--motor-off and --duty contradict each other")
+    if given.rate is not None and given.time:
+        parser.error("--rate and --time contradict each other: give one")
+    if given.rate is not None and given.clock != "auto":
+        parser.error("--clock is about stamps: leave it away with --rate")
+    named = [quantity for quantity in UNITS if getattr(given, quantity)]
+    if given.accept and named:
+        parser.error(f"--accept takes the proposal, --{named[0]} says otherwise: give one")
+    return given
+
+
+def _joined(arguments: Sequence[str]) -> list[str]:
+    """`--zero -83deg` as `--zero=-83deg`: argparse takes -83deg for an option."""
+    out: list[str] = []
+    for word in arguments:
+        if out and out[-1] == "--zero" and not word.startswith("--"):
+            out[-1] = f"--zero={word}"
+        else:
+            out.append(word)
+    return out
+
+
+def _delimiter(text: str) -> str:
+    mark = DELIMITERS.get(text, text)
+    if len(mark) != 1 or mark.isalnum() or mark in "\"'+-.\n\r":
+        raise argparse.ArgumentTypeError(f"'{text}' cannot split cells: give one mark, tab or blank")
+    return mark
+
+
+def plan_of(given: argparse.Namespace) -> Plan:
+    """What the command line says of the columns."""
+    return Plan(**{quantity: getattr(given, quantity) for quantity in UNITS}, rate=given.rate, zero=given.zero,
+                flip=given.flip, motor_off=given.motor_off, clock=given.clock, skip_bad=given.skip_bad)
+
+
+def run(given: argparse.Namespace, arguments: Sequence[str]) -> int:
+    """Import, or propose how to; returns the exit code.
+
+    Raises:
+        TableError, BagExistsError: a table cannot be used, or a recording not be made.
+    """
+    plan = plan_of(given)
+    if given.bag is None and (given.accept or plan.columns()):
+        raise TableError("name the recording to make, after the file")
+    bags = [given.bag] if len(given.files) == 1 else [given.bag / file.stem for file in given.files]
+    for bag in bags:
+        if bag is not None and bag.exists():
+            raise BagExistsError(f"{bag}: is there already: name another folder")
+    for done, (file, bag) in enumerate(zip(given.files, bags)):
+        try:
+            with progress(f"reading {printable(file.name)}") as show:
+                table = files.read(file, sheet=given.sheet, delimiter=given.delimiter, decimal=given.decimal)
+                now = plan
+                if not plan.columns():
+                    found = guess(table)
+                    chosen = options(table, found)
+                    if plan.rate is not None:
+                        chosen.pop("time", None)
+                    if not given.accept or not _enough(chosen, found, plan):
+                        return propose(table, found, chosen, given, arguments)
+                    now = replace(plan, **cast("dict[str, Any]", chosen))
+                taken = samples(table, now)
+                assert bag is not None
+                show(0.0, f"writing {printable(bag.name)}")
+                write(bag, taken, about(file, arguments, taken), show)
+        except (TableError, BagExistsError) as error:
+            ready = f" ({many(done, 'recording')} before it {'is' if done == 1 else 'are'} made)" if done else ""
+            raise TableError(f"{error}{ready}") from None
+        except OSError as error:
+            raise TableError(f"{bag}: cannot be written: {error.strerror or error}") from None
+        tell(bag, file, taken)
+    return 0
+
+
+def _enough(chosen: dict[str, str], found: Sequence[Guess], plan: Plan) -> bool:
+    if plan.rate is not None:
+        return "theta" in chosen and not any(one.quantity not in ("", "time") and not one.sure for one in found)
+    return is_obvious(chosen, list(found))
+
+
+def about(file: Path, arguments: Sequence[str], taken: Samples) -> dict[str, str]:
+    """Where a recording comes from, for its metadata; no folders of this machine."""
+    words = [Path(word).name if Path(word).name and not word.startswith("-") and Path(word).parent.is_dir()
+             and "/" in word else word for word in arguments]
+    found = {"imported_from": [file.name], "import_command": [shlex.join(["import", *words])],
+             "import_mapping": taken.mapping, "import_notes": taken.notes, "import_left_out": taken.left_out}
+    return {key: "\n".join(map(printable, lines)) for key, lines in found.items()}
+
+
+def tell(bag: Path, file: Path, taken: Samples) -> None:
+    """Say what was made of a file."""
+    seconds = float(taken.stamp_ns[-1] - taken.stamp_ns[0]) * 1e-9
+    rate = taken.rows / max(seconds, 1e-9)
+    lines = [f"{bag}: {many(taken.rows, 'row')} of {file.name}, {seconds:.1f} s, {rate:.4g} a second"]
+    lines += [f"  {line}" for line in taken.mapping] + [f"  note: {line}" for line in taken.notes]
+    if taken.left_out:
+        lines.append(f"  left out: column{'s' * (len(taken.left_out) > 1)} {', '.join(taken.left_out)}")
+    print("\n".join(map(printable, lines)))
+
+
+def propose(table: Table, found: Sequence[Guess], chosen: dict[str, str], given: argparse.Namespace,
+            arguments: Sequence[str]) -> int:
+    """Show a table and the command that would import it; returns the exit code."""
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=10_000)
+    shown = Shown(box=box.SIMPLE_HEAD, pad_edge=False)
+    for heading in ("column", "first values", "range", "looks like"):
+        shown.add_column(heading, overflow="fold")
+    for k, (column, one) in enumerate(zip(table.columns, found)):
+        x = column.values[np.isfinite(column.values)]
+        low_high = f"{x.min():.6g} to {x.max():.6g}" if len(x) and not column.is_clock else ""
+        what = f"{one.quantity}{'' if one.sure else '?'} ({one.why})" if one.quantity else one.why or "?"
+        cells = (table.label(k), "  ".join(column.shown), low_high, what)
+        shown.add_row(*(escape(printable(cell)) for cell in cells))
+    print(printable(f"{table.path}: {many(len(table), 'row')}"))
+    for note in table.notes:
+        print(f"  {printable(note)}")
+    console.print(shown)
+    if "time" not in chosen and given.rate is None and not any(one.quantity == "time" for one in found):
+        print(f"import: {one_line(no_time(table))}", file=sys.stderr)
+        return 2
+    bag = given.bag or Path(table.path.stem)
+    kept = [word for word in arguments if word not in ("--accept", *given.paths)]
+    words = ["import", str(table.path), str(bag)]
+    for quantity in UNITS:
+        if quantity in chosen:
+            words += [f"--{quantity}", chosen[quantity]]
+    missing = [f"--{quantity} COLUMN:UNIT" for quantity in ("time", "theta")
+               if quantity not in chosen and not (quantity == "time" and given.rate is not None)]
+    print("\n  " + printable(" ".join([shlex.join(words + kept), *missing])))
+    for k, one in enumerate(found):
+        if one.quantity and not one.sure:
+            print(printable(f"  perhaps --{one.quantity} {shlex.quote(option(table, k, one))} ({one.why})"))
+    off = "." if "duty" in chosen or given.motor_off else ",\n--motor-off if the motor was off all the time."
+    print("\nAdd --zero READING if --theta does not read 0 when the arm hangs, --flip if it falls when the arm is "
+          f"lifted{off}")
+    if _enough(chosen, found, plan_of(given)):
+        print("import: nothing imported yet: say what the columns are, as above, or take that with --accept",
+              file=sys.stderr)
+    else:
+        print("import: nothing imported: say what the columns are, which is not clear", file=sys.stderr)
+    return 2
+
+
+@interruptible
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit code."""
+    arguments = own(arguments)
+    given = parse(arguments)
+    try:
+        return run(given, arguments)
+    except (TableError, BagExistsError) as error:
+        print(f"import: {one_line(str(error))}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

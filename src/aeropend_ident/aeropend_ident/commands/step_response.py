@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command that describes the step responses in a recording; what a step response is, aeropend_control knows.
+
+A reference counts from the first sample recorded after it, until the next.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from aeropend_control.analysis import step_report
+from aeropend_control.analysis.step_response import StepError, step_responses
+from aeropend_control.laws.registry import LAWS
+from aeropend_ident.bags.recording import Recording, RecordingError, read
+from aeropend_sim.cli.command import EXIT_CODES, Parser, interruptible, own
+
+SHORTEST_S = 1.0
+"""A last step held for less is left out: recordings end at any time."""
+
+EXAMPLES = f"""\
+examples:
+  step_response my_bag
+  step_response my_bag --law cascade --plot steps.svg
+
+{EXIT_CODES}"""
+
+
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """Read the command line; exits with 2 and one line where it is wrong."""
+    parser = Parser(
+        prog="step_response", epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Print t_r, t_p, t_s, M_p and the steady-state error of every step of the reference in a "
+                    "recording, beside what they may be at most.")
+    parser.add_argument("bag", metavar="BAG", help="a rosbag2 folder, or a bare .mcap or .db3 file")
+    parser.add_argument("--law", choices=LAWS, default="feedback_linearization",
+                        help="the controller that ran: says what was controlled, and its limits; default %(default)s")
+    parser.add_argument("--namespace", help="the rig, when the recording holds several")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw reference, response and duty into an SVG file")
+    parser.add_argument("--overwrite", action="store_true", help="replace FILE if it is there")
+    options = parser.parse_args(arguments)
+    if options.plot is not None and options.plot.exists() and not options.overwrite:
+        parser.error(f"{options.plot} exists: give another --plot, or --overwrite")
+    return options
+
+
+def columns(recording: Recording, law: str) -> tuple[step_report.Array, dict[str, step_report.Array]]:
+    """Time (M,) and columns (M,) from the first reference on, on a grid.
+
+    Args:
+        recording: with references. law: a key of `LAWS`; references out of its range, which it refuses, do not count.
+
+    Raises:
+        StepError: no reference, or no response to it.
+    """
+    kind = LAWS[law]
+    low, high = kind.reference_limits
+    taken = (recording.reference >= low) & (recording.reference <= high)
+    at, levels = recording.reference_ns[taken], recording.reference[taken]
+    if not len(at):
+        raise StepError(f"{recording.path} holds no reference for {law} ({low:g} to {high:g} {kind.reference_unit})")
+    number = np.searchsorted(at, recording.received_ns, side="right")
+    used = number > 0
+    if not used.any() or not np.isfinite(getattr(recording, kind.measures)[used]).any():
+        raise StepError(f"{recording.path} holds no {kind.measures} after the first reference")
+    read_ = {name: getattr(recording, name)[used] for name in ("theta", "omega", "i_a", "v_a", "duty")}
+    try:
+        time, grid, _ = step_report.on_grid(recording.t[used], read_, recording.period)
+    except StepError as error:
+        raise StepError(f"{recording.path}: {error}") from None
+    before = np.searchsorted(recording.t[used], time + 0.5 * recording.period) - 1
+    grid["reference"] = levels[number[used] - 1][before]
+    last = int(np.flatnonzero(np.diff(grid["reference"], prepend=np.nan))[-1])
+    if last > 0 and time[-1] - time[last] < SHORTEST_S:
+        time, grid = time[:last], {name: values[:last] for name, values in grid.items()}
+    return time, grid
+
+
+def run(options: argparse.Namespace) -> None:
+    """Read, describe, print, draw.
+
+    Raises:
+        RecordingError, StepError: the recording cannot be used.
+        OSError: the drawing cannot be written.
+    """
+    kind = LAWS[options.law]
+    recording = read(options.bag, options.namespace)
+    time, grid = columns(recording, options.law)
+    y = grid[kind.measures]
+    try:
+        described = step_responses(time, y, grid["reference"])
+    except StepError as error:
+        raise StepError(f"{recording.path}: {error}") from None
+    if options.plot is not None:
+        options.plot.write_text(step_report.draw(time, grid["reference"], y, grid["duty"], recording.path,
+                                           f"{kind.measures} / {kind.reference_unit}"), encoding="utf-8")
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    console.print(step_report.table({options.law: described}, {options.law: kind.reference_unit}))
+
+
+@interruptible
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit code."""
+    options = parse(own(arguments))
+    try:
+        run(options)
+    except (RecordingError, StepError) as error:
+        print(f"step_response: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"step_response: {options.plot} cannot be written: {error.strerror}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

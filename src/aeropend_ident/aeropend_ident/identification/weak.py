@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The weak form: derivatives moved from the data to smooth test functions (Messenger & Bortz, 2021).
+
+∫ -φ' x dt = Σ c ∫ φ f(x, u) dt for test functions φ = (1 - s²)^p of compact support. Over such a function the
+trapezoidal rule is exact to high order for smooth f. Where a held input steps, the two sides of the step are averaged,
+so that the step costs no accuracy, and what is not smooth is cut: sides differ only in the input.
+
+How wide the functions are follows from the spectrum: they pass what stands out of the noise and no more. Their
+overlap, and the noise inside the terms, correlate the rows; these are whitened (generalised least squares; the noise
+inside the terms as in Bortz, Messenger & Dukic, WENDy, 2023).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cholesky_banded, solve_banded
+
+from aeropend_ident.identification.subset_selection import Sums
+from aeropend_ident.identification.terms import Array, Library
+from aeropend_ident.signals.derivatives import noise_of
+
+P = 8
+"""Power of the test functions: that many derivatives vanish at the ends."""
+
+NARROWEST, OVERLAP = 12, 4
+"""Least half-width in samples, and test functions that cover a sample, over two."""
+
+NUMERIC = 1e-5
+"""Share of a signal's spread that sampling it costs, however little noise there is (100 dB)."""
+
+BLOCKS = 24
+"""Parts of the data that are resampled."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Test functions on a grid: half-width m (samples), first sample of each (K,), values and slopes (2m + 1,)."""
+
+    half: int
+    first: NDArray[np.int64]
+    phi: Array
+    slope: Array
+
+    @classmethod
+    def over(cls, n: int, half: int, period: float) -> Windows:
+        """Windows of half-width `half` over n samples, overlapping; area 1.
+
+        Raises:
+            ValueError: there are fewer samples than a window has.
+        """
+        if n < 2 * half + 1:
+            raise ValueError(f"{n} samples are fewer than a window of {2 * half + 1}")
+        s = np.arange(-half, half + 1) / half
+        phi = (1.0 - s * s) ** P
+        slope = -2.0 * P * s * (1.0 - s * s) ** (P - 1) / (half * period)
+        area = phi.sum() * period
+        first = np.arange(0, n - 2 * half, max(1, half // OVERLAP), dtype=np.int64)
+        return cls(half, first, phi / area, slope / area)
+
+    def project(self, values: Array, weights: Array) -> Array:
+        """Sums of values (N, ...) times weights (2m + 1,) in every window: (K, ...)."""
+        length, rest = 2 * self.half + 1, values.shape[1:]
+        flat = np.ascontiguousarray(values).reshape(len(values), -1)
+        seen = np.lib.stride_tricks.sliding_window_view(flat, length, axis=0)[self.first]
+        return np.asarray(seen @ weights).reshape(len(self.first), *rest)
+
+
+def corner(x: Array) -> float:
+    """Frequency (cycles a sample) above which noise hides a signal (N,); ½ where it never does."""
+    n = len(x)
+    ramp = np.linspace(x[0], x[-1], n)
+    power = np.abs(np.fft.rfft((x - ramp) * np.hanning(n))) ** 2
+    bins = np.unique(np.geomspace(1, len(power), 60).astype(int))
+    mean = np.array([power[a:b].mean() for a, b in pairwise(bins)])
+    floor = float(np.median(power[int(0.7 * len(power)):]))
+    if floor <= 1e-18 * power.max():
+        return 0.5
+    over = np.flatnonzero(mean > 3.0 * floor)
+    return float(0.5 * bins[over[-1] + 1] / len(power)) if len(over) else 1.0 / n
+
+
+def half_width(x: Array) -> int:
+    """Half-width (samples) of the windows that a signal (N,) passes."""
+    return max(NARROWEST, round(1.5 * float(np.sqrt(2 * P + 3.0)) / (2.0 * np.pi * corner(x))))
+
+
+def sided(library: Library, states: Array, inputs: Array) -> Array:
+    """Terms (N, terms) at the samples, the mean of both sides of a step of the held inputs."""
+    now = library(np.column_stack([states, inputs]))
+    if inputs.shape[1] == 0:
+        return now
+    before = library(np.column_stack([states, np.vstack([inputs[:1], inputs[:-1]])]))
+    return np.asarray(0.5 * (now + before))
+
+
+class Weak:
+    """The weak form of a recording over a library, every equation with windows of its own width.
+
+    Args:
+        library: terms over states and inputs. states: (N, S). inputs: (N, U), held. period: s.
+        noise: (S,) standard deviation of the states; None: as they show it.
+        coarse: (S,) samples over which a description of a state is smooth by making; no window is narrower.
+    """
+
+    def __init__(self, library: Library, states: Array, inputs: Array, period: float, noise: Array | None = None,
+                 coarse: Array | None = None) -> None:
+        self.library, self.states, self.inputs, self.period = library, states, inputs, period
+        coarse = np.zeros(states.shape[1]) if coarse is None else coarse
+        widest = max(len(states) // 20, NARROWEST)
+        self.halves = [int(min(max(half_width(x), c), widest)) for x, c in zip(states.T, coarse)]
+        self.terms = sided(library, states, inputs)
+        self.noise = np.hypot(noise_of(states) if noise is None else noise, NUMERIC * states.std(axis=0))
+        self._windows: dict[int, tuple[Windows, Array]] = {}
+
+    def windows(self, equation: int) -> tuple[Windows, Array]:
+        """The windows of an equation, and the terms (K, terms) in them."""
+        half = self.halves[equation]
+        if half not in self._windows:
+            windows = Windows.over(len(self.states), half, self.period)
+            self._windows[half] = windows, windows.project(self.terms, windows.phi) * self.period
+        return self._windows[half]
+
+    def blocks(self, equation: int, coefficients: Array | None = None, known: Array | None = None) -> list[Sums]:
+        """The whitened regression of one equation in blocks of time.
+
+        Args:
+            equation: index of the state. coefficients: (terms,) present estimate, for the noise inside the terms.
+            known: (N,) part of the derivative that is known (discrepancy).
+        """
+        windows, right = self.windows(equation)
+        left = -windows.project(self.states[:, equation], windows.slope) * self.period
+        off = np.zeros(len(left)) if known is None else windows.project(known, windows.phi) * self.period
+        rows = self._whiten(np.column_stack([right, left - off, off]), equation, coefficients)
+        parts = np.array_split(rows, min(BLOCKS, max(1, len(rows) // 8)))
+        return [Sums.of(p[:, :-2], p[:, -2], p[:, -1]) for p in parts]
+
+    def _whiten(self, rows: Array, equation: int, coefficients: Array | None) -> Array:
+        """Divide by a root of the rows' covariance: noise of the state under φ', and of all states inside the terms."""
+        w, _ = self.windows(equation)
+        step = int(w.first[1] - w.first[0]) if len(w.first) > 1 else 1
+        K, length = len(rows), len(w.phi)
+        lags = min(K - 1, (length - 1) // step)
+        band = np.zeros((lags + 1, K))
+        # a residual is left - right: the noise of state j enters it with the weights -φ' (its own) - φ ∂f/∂x_j
+        slopes = np.zeros((len(self.states), self.states.shape[1]))
+        if coefficients is not None and np.any(coefficients):
+            slopes = self._slopes(coefficients)
+        for j in range(self.states.shape[1]):
+            if self.noise[j] == 0.0:
+                continue
+            local = w.project(slopes[:, j : j + 1], w.phi / w.phi.sum())[:, 0]  # mean slope in each window
+            for lag in range(lags + 1):
+                shift = lag * step
+                a, b = slice(shift, length), slice(0, length - shift)
+                pp = float(w.phi[a] @ w.phi[b])
+                ss = float(w.slope[a] @ w.slope[b]) if j == equation else 0.0
+                cross = float(w.slope[a] @ w.phi[b] - w.phi[a] @ w.slope[b]) if j == equation else 0.0
+                k = K - lag
+                band[lag, :k] += self.noise[j] ** 2 * (
+                    ss + pp * local[lag:] * local[:k] + 0.5 * cross * (local[:k] - local[lag:]))
+        band *= self.period**2
+        scale = float(np.mean((rows[:, -1] + rows[:, -2]) ** 2)) + 1e-300
+        band[0] += 1e-12 * scale + 1e-9 * band[0].max()
+        root = cholesky_banded(band, lower=True)
+        return np.asarray(solve_banded((lags, 0), root, rows))
+
+    def _slopes(self, coefficients: Array) -> Array:
+        """Derivative (N, S) of the right-hand side by each state, from differences."""
+        used = np.flatnonzero(coefficients)
+        small = Library.of(self.library.variables, [self.library.names[j] for j in used])
+        out = np.empty_like(self.states)
+        for j in range(self.states.shape[1]):
+            step = 1e-4 * (float(np.std(self.states[:, j])) + 1e-12)
+            up, down = self.states.copy(), self.states.copy()
+            up[:, j] += step
+            down[:, j] -= step
+            difference = small(np.column_stack([up, self.inputs])) - small(np.column_stack([down, self.inputs]))
+            out[:, j] = difference @ coefficients[used] / (2.0 * step)
+        return out

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A swinging arm in tables of other programs, and their import."""
+
+import numpy as np
+import openpyxl
+
+from aeropend_ident.bags.recording import read
+from aeropend_ident.commands.import_table import main
+
+RATE = 50.0
+TIME = np.arange(200) / RATE
+ANGLE = 40.0 * np.exp(-0.1 * TIME) * np.cos(6.0 * TIME)  # deg
+DUTY = np.floor(TIME) % 2 * 30.0  # %
+MAPPED = ("--time", "t:s", "--theta", "x:deg")
+
+
+def lines(*columns, form="{:.4f}", split=",", end="\n"):
+    """Rows of text."""
+    return "".join(split.join(form.format(x) for x in row) + end for row in zip(*columns))
+
+
+NUMBERS = lines(TIME, ANGLE)
+
+
+def comma(text):
+    return text.replace(".", ",")
+
+
+def put(tmp_path, content, name="run.csv", encoding="utf-8"):
+    path = tmp_path / name
+    path.write_bytes(content if isinstance(content, bytes) else content.encode(encoding))
+    return path
+
+
+def imported(tmp_path, path, *options):
+    """Import, and read the recording."""
+    bag = tmp_path / f"bag{len(list(tmp_path.iterdir()))}"
+    assert main([str(path), str(bag), *options]) == 0
+    return read(bag)
+
+
+def refused(capsys, *arguments):
+    """The one line that is said, and no more."""
+    try:
+        code = main([str(one) for one in arguments])
+    except SystemExit as error:
+        code = error.code
+    said = capsys.readouterr().err
+    assert code == 2
+    assert said.startswith("import: ")
+    assert said.count("\n") == 1
+    return said
+
+
+def workbook(path, rows, title="Data", more=()):
+    book = openpyxl.Workbook()
+    sheet = book.active
+    sheet.title = title
+    for row in rows:
+        sheet.append(row)
+    for name, others in more:
+        other = book.create_sheet(name)
+        for row in others:
+            other.append(row)
+    book.save(path)
+    return path
+
+
+def table_rows(*head):
+    return [*head, *([float(t), float(x), float(u)] for t, x, u in zip(TIME, ANGLE, DUTY))]

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+
+from aeropend_ident.diagnosis.free_run_gap import closed, floor, free_run, gap
+from aeropend_ident.testing.rigs import BENCH, drawn_rig, recorded
+
+
+def measured(model, seed=21, effects=None):
+    signals = recorded(seed, effects, duration=25.0)
+    start, stop = signals.train, len(signals)
+    return gap(free_run(model, signals), signals, start, stop), floor(signals, start, stop)
+
+
+def test_the_true_model_runs_down_to_the_floor():
+    found, floors = measured(drawn_rig(21, {}))
+    for channel in ("theta", "i_a", "v_a"):
+        assert found.rms[channel] == pytest.approx(floors[channel], rel=0.1)
+    assert found.rms["omega"] < 2.0 * floors["omega"]
+    assert found.total == pytest.approx(
+        np.sqrt(np.mean([(found.rms[c] / found.spread[c]) ** 2 for c in found.rms])))
+
+
+def test_share_of_what_can_close():
+    effects = {"coulomb_friction": {}}
+    before, floors = measured(BENCH, effects=effects)
+    after, _ = measured(drawn_rig(21, effects), effects=effects)
+    share, low, high = closed(before, after, floors)
+    assert 0.97 < low <= share <= high <= 1.0
+    assert closed(before, before, floors)[0] == pytest.approx(0.0)
+    assert closed(after, after, floors) == (None, None, None)

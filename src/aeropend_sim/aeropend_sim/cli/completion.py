@@ -1,0 +1,21 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Completion of every command with TAB, in bash and zsh: `eval "$(python -m aeropend_sim.cli.completion)"`."""
+
+from importlib.metadata import EntryPoint, entry_points
+
+
+def commands() -> list[EntryPoint]:
+    """All commands of the installed packages, by name."""
+    ours = {e.name: e for e in entry_points(group="console_scripts") if e.value.startswith("aeropend_")}
+    return [ours[name] for name in sorted(ours)]
+
+
+def main() -> None:
+    """Print what the shell is to run."""
+    from argcomplete.shell_integration import shellcode
+
+    print(shellcode([command.name for command in commands()], use_defaults=False))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,724 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The equations of the plant, once: nominal and with every effect, for one hold of the input at a time.
+
+The chain is advanced in the direction of cause: winding and rotor (which act on each other), air, arm. Winding, rotor
+and air are first-order lags, advanced exactly for an input that is quadratic over the hold (exponential time
+differencing, Cox & Matthews 2002); the arm by the fourth-order Runge-Kutta-Nyström method. So a hold as long as the
+electrical time constant costs no accuracy. A longer hold, or that of a faster plant, is cut into equal steps.
+
+`Values` of effects are passed as None for the nominal model: numba then compiles the equations without them.
+
+Source of the nominal equations: thesis (3.2) to (3.5), with the quadratic load of FACTS.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from aeropend_sim.model import actuator
+from aeropend_sim.model.effects import PARAMETER_MISMATCH, Values, is_active, values
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+
+Array = NDArray[np.float64]
+
+equation = njit(cache=True, forceinline=True, error_model="numpy")
+"""Compiles one equation into whatever calls it, without a test for zero before each division."""
+
+THRUST_PIVOT_SPEED = 150.0
+"""rad/s at which `thrust_exponent` leaves the thrust as it is (contract section 4)."""
+
+NO_LAG = 1e-6
+"""A lag shorter than this share of a step is none."""
+
+ROUND = 6755399441055744.0
+"""1.5 · 2^52: added and taken off again, it rounds to the nearest integer."""
+
+BRUSH_CURRENT = 0.02
+"""A over which the brush drop turns from one sign to the other (contract section 4)."""
+
+LONGEST_STEP = 2.5e-3
+"""s: one step over a longer hold would miss more than 2e-5 of the range of `bench`."""
+
+MOST_STEPS = 1000
+"""Steps that a hold is cut into at most, however fast the numbers say that the plant is."""
+
+
+class Lag(NamedTuple):
+    """Weights of a first-order lag ẋ = -a x + g over a hold of h, for g quadratic through its values at 0, h/2, h.
+
+    x(h) = decay x + w0 g0 + w1 g(h/2) + w2 g(h), and x(h/2) likewise with half_decay, u0, u1, u2.
+    """
+
+    decay: float
+    w0: float
+    w1: float
+    w2: float
+    half_decay: float
+    u0: float
+    u1: float
+    u2: float
+
+
+@equation
+def lag(a: float, h: float) -> Lag:
+    """The weights for rate a (1/s, >= 0) and hold h (s)."""
+    half = math.exp(-0.5 * a * h)
+    full = half * half
+    p1, p2, p3 = _phi(full, -a * h)
+    q1, q2, q3 = _phi(half, -0.5 * a * h)
+    s = 0.5 * h
+    return Lag(full, h * (p1 - 3.0 * p2 + 4.0 * p3), h * (4.0 * p2 - 8.0 * p3), h * (4.0 * p3 - p2),
+               half, s * (q1 - 1.5 * q2 + q3), s * (2.0 * q2 - 2.0 * q3), s * (q3 - 0.5 * q2))
+
+
+@equation
+def _phi(exp_z: float, z: float) -> tuple[float, float, float]:
+    """The functions of exponential integrators, φ_k(z) = Σ z^j / (j + k)!, for k = 1, 2, 3."""
+    if abs(z) > 0.3:
+        per_z = 1.0 / z
+        p1 = (exp_z - 1.0) * per_z
+        p2 = (p1 - 1.0) * per_z
+        return p1, p2, (p2 - 0.5) * per_z
+    p3 = term = 1.0 / 6.0
+    for j in range(4, 16):
+        term *= z / j
+        p3 += term
+    p2 = 0.5 + z * p3
+    return 1.0 + z * p2, p2, p3
+
+
+class Coefficients(NamedTuple):
+    """What the equations need of a model for one length of hold, precomputed by `prepare`: `steps` steps of `h` s."""
+
+    steps: int
+    h: float
+    winding: Lag
+    rotor: Lag
+    per_L: float
+    K_e: float
+    torque: float
+    load: float
+    drag: float
+    k_thrust: float
+    gravity: float
+    damping: float
+    lever: float
+
+
+class Extra(NamedTuple):
+    """As `Coefficients`, for the effects: the weights that depend on their parameters."""
+
+    cooling: Lag
+    air: Lag
+    R_a: float
+    R_total: float
+    J_m: float
+    gust_decay: float
+    gust_kick: float
+    per_free_inertia: float
+    per_width: float
+
+
+class State(NamedTuple):
+    """State of the plant at an instant, SI. The last four belong to effects and stay 0 without them."""
+
+    i_a: float = 0.0
+    omega: float = 0.0
+    rotor_angle: float = 0.0
+    theta: float = 0.0
+    theta_dot: float = 0.0
+    thrust: float = 0.0
+    heat: float = 0.0
+    flex: float = 0.0
+    flex_dot: float = 0.0
+    gust: float = 0.0
+
+
+@equation
+def sine_cosine(x: float) -> tuple[float, float]:
+    """(sin x, cos x) to 1e-15 within some turns, without a branch or a call: many models then advance in SIMD lanes."""
+    k = (x * (1.0 / math.pi) + ROUND) - ROUND
+    r = x - k * math.pi
+    z = r * r
+    z2 = z * z
+    z4 = z2 * z2
+    # Taylor series over [-π/2, π/2], summed in Estrin's order
+    s = ((1.0 - z * (1.0 / 6.0)) + z2 * (1.0 / 120.0 - z * (1.0 / 5040.0))
+         + z4 * ((1.0 / 362880.0 - z * (1.0 / 39916800.0)) + z2 * (1.0 / 6227020800.0 - z * (1.0 / 1307674368000.0)))
+         + z4 * z4 * (1.0 / 355687428096000.0 - z * (1.0 / 121645100408832000.0)))
+    c = ((1.0 - z * (1.0 / 2.0)) + z2 * (1.0 / 24.0 - z * (1.0 / 720.0))
+         + z4 * ((1.0 / 40320.0 - z * (1.0 / 3628800.0)) + z2 * (1.0 / 479001600.0 - z * (1.0 / 87178291200.0)))
+         + z4 * z4 * ((1.0 / 20922789888000.0 - z * (1.0 / 6402373705728000.0)) + z2 * (1.0 / 2432902008176640000.0)))
+    odd = k - 2.0 * ((0.5 * k + ROUND) - ROUND)
+    sign = 1.0 - 2.0 * odd * odd
+    return sign * r * s, sign * c
+
+
+@equation
+def near(sin_x: float, cos_x: float, d: float) -> float:
+    """sin(x + d) for a small d, to d²/2."""
+    return sin_x + d * cos_x
+
+
+@equation
+def winding(i0: float, v: float, w0: float, wm: float, w1: float, k: Lag, c: Coefficients) -> tuple[float, float]:
+    """L_a di/dt = v - R_a i - K_e ω, thesis (3.5): current at h/2 and h, for the speed at 0, h/2, h."""
+    g0, gm, g1 = (v - c.K_e * w0) * c.per_L, (v - c.K_e * wm) * c.per_L, (v - c.K_e * w1) * c.per_L
+    return (k.half_decay * i0 + k.u0 * g0 + k.u1 * gm + k.u2 * g1,
+            k.decay * i0 + k.w0 * g0 + k.w1 * gm + k.w2 * g1)
+
+
+@equation
+def rotor(w0: float, i0: float, im: float, i1: float, wm: float, w1: float, friction: float,
+          c: Coefficients) -> tuple[float, float]:
+    """J_m dω/dt = K_t i - B_m ω - k_load ω|ω|: speed at h/2 and h, for the current at 0, h/2, h.
+
+    wm and w1 are guesses that place the slow quadratic load; friction is Coulomb torque over inertia, with its sign.
+    """
+    g0 = c.torque * i0 - c.load * w0 * abs(w0) - friction
+    gm = c.torque * im - c.load * wm * abs(wm) - friction
+    g1 = c.torque * i1 - c.load * w1 * abs(w1) - friction
+    k = c.rotor
+    return (k.half_decay * w0 + k.u0 * g0 + k.u1 * gm + k.u2 * g1,
+            k.decay * w0 + k.w0 * g0 + k.w1 * gm + k.w2 * g1)
+
+
+@equation
+def winding_rotor(i0: float, w0: float, v: float, heat: float, c: Coefficients, e: Values | None,
+                  x: Extra | None) -> tuple[float, float, float, float]:
+    """Winding and rotor together over one hold: (i(h/2), i(h), ω(h/2), ω(h)), by two sweeps over the pair."""
+    friction, sticks = 0.0, False
+    if e is not None and e.rotor_friction_torque > 0.0:
+        friction = e.rotor_friction_torque / x.J_m
+        drive = c.torque * i0
+        sticks = w0 == 0.0 and abs(drive) <= friction
+        if w0 < 0.0 or (w0 == 0.0 and drive < 0.0):
+            friction = -friction
+    slope = c.h * (c.torque * i0 - c.load * w0 * abs(w0) - c.drag * w0 - friction)
+    wm, w1 = w0 + 0.5 * slope, w0 + slope
+    if sticks:
+        wm, w1 = 0.0, 0.0
+    im, i1 = i0, i0
+    k, drop, pieces = c.winding, 0.0, 1
+    if e is not None and (e.brush_drop_v_brush > 0.0 or e.winding_heating_gain > 0.0):
+        k, drop, pieces = linearised_winding(i0, v - c.K_e * w0, heat, c, e, x)
+    for _ in range(2):
+        if e is not None and pieces > 1:
+            im, i1 = brush_winding(i0, v, w0, wm, w1, heat, pieces, c, e, x)
+        else:
+            im, i1 = winding(i0, v - drop, w0, wm, w1, k, c)
+        if sticks:
+            wm, w1 = breakaway(c.torque * i0, c.torque * im, c.torque * i1, abs(friction), 0.5 * c.h)
+        else:
+            wm, w1 = rotor(w0, i0, im, i1, wm, w1, friction, c)
+    if e is not None and not sticks and friction * w1 < 0.0:
+        wm, w1 = wm if w0 * wm > 0.0 else 0.0, 0.0  # it stops; whether it turns again the next step decides
+    return im, i1, wm, w1
+
+
+@equation
+def breakaway(d0: float, dm: float, d1: float, limit: float, s: float) -> tuple[float, float]:
+    """Speed after s and 2s of a rotor that sticks until |drive| > limit, for the drive at 0, s, 2s, linear between."""
+    a, b = abs(dm) - limit, abs(d1) - limit
+    if a > 0.0:
+        wm = 0.5 * s * a * a / (abs(dm) - abs(d0))
+        return math.copysign(wm, dm), math.copysign(max(wm + 0.5 * s * (a + b), 0.0), dm)
+    if b > 0.0:
+        return 0.0, math.copysign(0.5 * s * b * b / (abs(d1) - abs(dm)), d1)
+    return 0.0, 0.0
+
+
+@equation
+def brush_sign(i: float) -> float:
+    """tanh(i/0.02), to 4e-9."""
+    if abs(i) > 10.0 * BRUSH_CURRENT:
+        return math.copysign(1.0, i)
+    return 1.0 - 2.0 / (1.0 + math.exp(2.0 * i / BRUSH_CURRENT))
+
+
+@equation
+def linearised_winding(i0: float, v: float, heat: float, c: Coefficients, e: Values, x: Extra
+                       ) -> tuple[Lag, float, int]:
+    """The winding with brushes and heat, v - v_brush tanh(i/0.02) - R(T) i - K_e ω, made linear around i0.
+
+    Args:
+        i0: current; v: voltage less back-EMF; heat: T in the middle; c, e, x: coefficients.
+
+    Returns:
+        Its weights, the constant part of the brush drop, and into how many pieces the hold must be cut because the
+        current crosses the bend of the tanh.
+    """
+    resistance = x.R_total + x.R_a * e.winding_heating_gain * heat
+    if e.brush_drop_v_brush == 0.0:
+        return lag(resistance * c.per_L, c.h), 0.0, 1
+    t = brush_sign(i0)
+    stiffness = e.brush_drop_v_brush * (1.0 - t * t) / BRUSH_CURRENT
+    k = lag((resistance + stiffness) * c.per_L, c.h)
+    drop = e.brush_drop_v_brush * t - stiffness * i0
+    i1 = k.decay * i0 + (1.0 - k.decay) * (v - drop) / (resistance + stiffness)
+    pieces = 1
+    if i0 * i1 < 0.0 or min(abs(i0), abs(i1)) < 6.0 * BRUSH_CURRENT:
+        pieces = 1 + min(15, int(abs(i1 - i0) / (0.2 * BRUSH_CURRENT)))
+    return k, drop, pieces
+
+
+@equation
+def brush_winding(i0: float, v: float, w0: float, wm: float, w1: float, heat: float, pieces: int, c: Coefficients,
+                  e: Values, x: Extra) -> tuple[float, float]:
+    """As `winding`, the hold cut in pieces, made linear in each (exponential Rosenbrock-Euler method)."""
+    resistance = x.R_total + x.R_a * e.winding_heating_gain * heat
+    pieces += pieces % 2
+    h = c.h / pieces
+    i = im = i0
+    for j in range(pieces):
+        s = (j + 0.5) / pieces
+        w = w0 + s * (4.0 * wm - 3.0 * w0 - w1) + s * s * (2.0 * w0 - 4.0 * wm + 2.0 * w1)
+        t = brush_sign(i)
+        total = resistance + e.brush_drop_v_brush * (1.0 - t * t) / BRUSH_CURRENT
+        forcing = v - c.K_e * w - e.brush_drop_v_brush * t - resistance * i
+        i += (1.0 - math.exp(-total * c.per_L * h)) / total * forcing
+        if 2 * (j + 1) == pieces:
+            im = i
+    return im, i
+
+
+@equation
+def static_thrust(w: float, c: Coefficients, e: Values | None) -> float:
+    """Thrust of a steady speed: f = k_thrust ω|ω|, thesis (3.3)."""
+    if e is not None and e.thrust_exponent_n != 2.0:
+        size = c.k_thrust * THRUST_PIVOT_SPEED**2 * (abs(w) / THRUST_PIVOT_SPEED) ** e.thrust_exponent_n
+        return math.copysign(size, w)
+    return c.k_thrust * w * abs(w)
+
+
+@equation
+def static_thrust_near(w: float, w0: float, f0: float, c: Coefficients, e: Values | None) -> float:
+    """As `static_thrust`, given f0 of a speed w0: if that is close, by the binomial series, which costs less."""
+    if e is None or e.thrust_exponent_n == 2.0 or abs(w - w0) >= 0.05 * abs(w0):
+        return static_thrust(w, c, e)
+    n, d = e.thrust_exponent_n, w / w0 - 1.0
+    return f0 * (1.0 + n * d * (1.0 + (n - 1.0) / 2.0 * d * (1.0 + (n - 2.0) / 3.0 * d * (1.0 + (n - 3.0) / 4.0 * d))))
+
+
+@equation
+def arm_drive(sin_theta: float, theta: float, theta_dot: float, f: float, w: float, flex: float, flex_dot: float,
+              gust: float, c: Coefficients, e: Values | None) -> float:
+    """Torque on the arm over its inertia, less dry friction: -(mgd/J) sin θ - (c/J) θ̇ + (L/J) f, thesis (3.2)."""
+    if e is None:
+        return (c.lever * f - c.damping * theta_dot) - c.gravity * sin_theta
+    damping = c.damping + c.lever * e.axial_inflow_k * w + e.quadratic_drag_k * abs(theta_dot)
+    other = gust - e.cable_torque_k * (theta - e.cable_torque_theta0) + flex_restoring(flex, flex_dot, e)
+    return ((c.lever * f - damping * theta_dot) - c.gravity * sin_theta) + other
+
+
+@equation
+def near_ground(theta: float, e: Values | None) -> float:
+    """Share by which the ground effect raises the thrust: gain exp(-|θ|/width)."""
+    if e is None or e.ground_effect_gain == 0.0:
+        return 0.0
+    return e.ground_effect_gain * math.exp(-abs(theta) / e.ground_effect_width)
+
+
+@equation
+def nearer_ground(g: float, theta: float, moved: float, e: Values | None, x: Extra | None) -> float:
+    """`near_ground` of an angle that has moved a little from theta, where it is g."""
+    if e is None or e.ground_effect_gain == 0.0:
+        return 0.0
+    return g + g * ((abs(theta) - abs(moved)) * x.per_width)
+
+
+@equation
+def flex_restoring(flex: float, flex_dot: float, e: Values) -> float:
+    """What pulls the mast back: 2 zeta omega q̇ + omega² q."""
+    if e.mast_flex_coupling == 0.0:
+        return 0.0
+    return 2.0 * e.mast_flex_zeta * e.mast_flex_omega * flex_dot + e.mast_flex_omega**2 * flex
+
+
+@equation
+def arm(y: float, yd: float, q: float, qd: float, f0: float, fm: float, f1: float, w0: float, wm: float, w1: float,
+        friction: float, gust: float, c: Coefficients, e: Values | None, x: Extra | None
+        ) -> tuple[float, float, float, float]:
+    """The arm, and the mast's mode, over one hold by the Runge-Kutta-Nyström method of fourth order.
+
+    Args:
+        y: θ; yd: θ̇; q: deflection of the mast; qd: its rate.
+        f0: thrust at 0, and fm, f1 at h/2, h; w0, wm, w1: speed.
+        friction: dry friction over inertia, with the sign of the motion.
+        gust: random torque over inertia, held.
+        c: coefficients.
+        e: effects.
+
+    Returns:
+        θ, θ̇, q, q̇ at h.
+    """
+    s = 0.5 * c.h
+    # One sine and cosine, in the middle; those of the ends by turning it: the stages need not wait for each other.
+    # So with the ground effect: where the arm would be without acceleration, then moved a little.
+    d = s * yd
+    sin_m, cos_m = sine_cosine(y + d)
+    d2 = d * d
+    sin_d, cos_d = d * (1.0 - d2 * (1.0 / 6.0 - d2 * (1.0 / 120.0))), 1.0 - d2 * (0.5 - d2 * (1.0 / 24.0))
+    sin_1, cos_1 = sin_m * cos_d + cos_m * sin_d, cos_m * cos_d - sin_m * sin_d
+    g0, gm, g1 = near_ground(y, e), near_ground(y + d, e), near_ground(y + 2.0 * d, e)
+    f0 += f0 * g0
+    a1, b1 = arm_stage(sin_m * cos_d - cos_m * sin_d, y, yd, q, qd, f0, w0, friction, gust, c, e, x)
+    bend = 0.5 * s * s * a1
+    sin_m, middle, qm = near(sin_m, cos_m, bend), y + d + bend, q + s * (qd + 0.5 * s * b1)
+    fm += fm * nearer_ground(gm, y + d, middle, e, x)
+    a2, b2 = arm_stage(sin_m, middle, yd + s * a1, qm, qd + s * b1, fm, wm, friction, gust, c, e, x)
+    a3, b3 = arm_stage(sin_m, middle, yd + s * a2, qm, qd + s * b2, fm, wm, friction, gust, c, e, x)
+    bend = c.h * s * a3
+    end = y + 2.0 * d + bend
+    a4, b4 = arm_stage(near(sin_1, cos_1, bend), end, yd + c.h * a3, q + c.h * (qd + s * b3), qd + c.h * b3,
+                       f1 + f1 * nearer_ground(g1, y + 2.0 * d, end, e, x), w1, friction, gust, c, e, x)
+    return (y + c.h * (yd + s * (1.0 / 3.0) * (a1 + a2 + a3)), yd + s * (1.0 / 3.0) * (a1 + 2.0 * (a2 + a3) + a4),
+            q + c.h * (qd + s * (1.0 / 3.0) * (b1 + b2 + b3)), qd + s * (1.0 / 3.0) * (b1 + 2.0 * (b2 + b3) + b4))
+
+
+@equation
+def arm_stage(sin_y: float, y: float, yd: float, q: float, qd: float, f: float, w: float, friction: float, gust: float,
+              c: Coefficients, e: Values | None, x: Extra | None) -> tuple[float, float]:
+    """Accelerations (θ̈, q̈): the mast's mode carries a share of the arm's inertia and acts back with -q̈."""
+    drive = arm_drive(sin_y, y, yd, f, w, q, qd, gust - friction, c, e)
+    if e is None:
+        return drive, 0.0
+    acceleration = drive * x.per_free_inertia
+    return acceleration, -flex_restoring(q, qd, e) - e.mast_flex_coupling * acceleration
+
+
+@equation
+def mast_alone(q: float, qd: float, c: Coefficients, e: Values) -> tuple[float, float]:
+    """The mast's mode over one hold while the arm sticks: q, q̇ at h, as in `arm`."""
+    s = 0.5 * c.h
+    b1 = -flex_restoring(q, qd, e)
+    qm = q + s * (qd + 0.5 * s * b1)
+    b2 = -flex_restoring(qm, qd + s * b1, e)
+    b3 = -flex_restoring(qm, qd + s * b2, e)
+    b4 = -flex_restoring(q + c.h * (qd + s * b3), qd + c.h * b3, e)
+    return q + c.h * (qd + s * (1.0 / 3.0) * (b1 + b2 + b3)), qd + s * (1.0 / 3.0) * (b1 + 2.0 * (b2 + b3) + b4)
+
+
+@equation
+def arm_with_dry_friction(y: float, yd: float, q: float, qd: float, f0: float, fm: float, f1: float, w0: float,
+                          wm: float, w1: float, gust: float, c: Coefficients, e: Values,
+                          x: Extra) -> tuple[float, float, float, float]:
+    """As `arm`, with Coulomb friction.
+
+    Where the motion reverses, the hold is cut at that instant, and the arm sticks there unless it is driven harder than
+    friction holds.
+    """
+    limit = e.coulomb_friction_accel
+    direction = 1.0 if yd > 0.0 else -1.0
+    if yd == 0.0:
+        drive = arm_drive(math.sin(y), y, 0.0, f0 * (1.0 + near_ground(y, e)), w0, q, qd, gust, c, e)
+        if abs(drive) <= limit:  # it sticks; the mast swings on alone
+            q, qd = mast_alone(q, qd, c, e)
+            return y, 0.0, q, qd
+        direction = 1.0 if drive > 0.0 else -1.0
+    y1, yd1, q1, qd1 = arm(y, yd, q, qd, f0, fm, f1, w0, wm, w1, direction * limit, gust, c, e, x)
+    if yd == 0.0 or yd * yd1 > 0.0:
+        return y1, yd1, q1, qd1
+    reached = yd / (yd - yd1) if yd != yd1 else 1.0
+    y1 = y + 0.5 * reached * c.h * yd
+    f = (f0 + reached * (f1 - f0)) * (1.0 + near_ground(y1, e))
+    drive = arm_drive(math.sin(y1), y1, 0.0, f, w1, q1, qd1, gust, c, e)
+    if abs(drive) <= limit:
+        return y1, 0.0, q1, qd1
+    rest = (1.0 - reached) * c.h
+    acceleration = (drive - limit if drive > 0.0 else drive + limit) * x.per_free_inertia
+    return y1 + 0.5 * rest * rest * acceleration, rest * acceleration, q1, qd1
+
+
+@equation
+def advance_motor(state: State, v: float, c: Coefficients, e: Values | None, x: Extra | None
+                  ) -> tuple[float, float, float, float, float]:
+    """Winding and rotor over one step of v: current, speed at h/2 and h, angle turned, heat."""
+    i0, w0 = state.i_a, state.omega
+    heat = state.heat
+    if e is not None and e.winding_heating_gain > 0.0:
+        heat += 0.5 * c.h * (i0 * i0 - heat / e.winding_heating_tau)
+    im, i1, wm, w1 = winding_rotor(i0, w0, v, heat, c, e, x)
+    angle = state.rotor_angle + c.h * (1.0 / 6.0) * (w0 + 4.0 * wm + w1)
+    heat = 0.0
+    if e is not None and e.winding_heating_gain > 0.0:
+        k = x.cooling
+        heat = k.decay * state.heat + k.w0 * i0 * i0 + k.w1 * im * im + k.w2 * i1 * i1
+    return i1, wm, w1, angle, heat
+
+
+@equation
+def advance_arm(state: State, wm: float, w1: float, c: Coefficients, e: Values | None, x: Extra | None
+                ) -> tuple[float, float, float, float, float]:
+    """Air and arm over one step, for the speed at 0 (in the state), h/2 and h: θ, θ̇, thrust, q, q̇."""
+    w0, y, yd = state.omega, state.theta, state.theta_dot
+    f0 = static_thrust(w0, c, e)
+    fm, f1 = static_thrust_near(wm, w0, f0, c, e), static_thrust_near(w1, w0, f0, c, e)
+    if e is None:
+        y, yd, _, _ = arm(y, yd, 0.0, 0.0, f0, fm, f1, w0, wm, w1, 0.0, 0.0, c, e, x)
+        return y, yd, f1, 0.0, 0.0
+    if e.thrust_lag_tau > NO_LAG * c.h:
+        k = x.air
+        a = 1.0 / e.thrust_lag_tau
+        s0, sm, s1 = a * f0, a * fm, a * f1
+        f0 = state.thrust
+        fm, f1 = (k.half_decay * f0 + k.u0 * s0 + k.u1 * sm + k.u2 * s1,
+                  k.decay * f0 + k.w0 * s0 + k.w1 * sm + k.w2 * s1)
+    q, qd = state.flex, state.flex_dot
+    if e.coulomb_friction_accel > 0.0:
+        y, yd, q, qd = arm_with_dry_friction(y, yd, q, qd, f0, fm, f1, w0, wm, w1, state.gust, c, e, x)
+    else:
+        y, yd, q, qd = arm(y, yd, q, qd, f0, fm, f1, w0, wm, w1, 0.0, state.gust, c, e, x)
+    return y, yd, f1, q, qd
+
+
+@equation
+def advance(state: State, v: float, c: Coefficients, e: Values | None, x: Extra | None) -> State:
+    """The whole plant over one step, the gust held.
+
+    Args:
+        state: at the start.
+        v: voltage at the bridge, held (`actuator.acting_voltage`).
+        c: coefficients.
+        e: effects, and x, their coefficients; None twice for the nominal plant.
+    """
+    i1, wm, w1, angle, heat = advance_motor(state, v, c, e, x)
+    y, yd, f1, q, qd = advance_arm(state, wm, w1, c, e, x)
+    return State(i1, w1, angle, y, yd, f1, heat, q, qd, state.gust)
+
+
+def steady(model: Model, duty: float) -> State:
+    """The state in which a duty holds the nominal plant; the arm at rest below where the thrust exceeds its weight."""
+    n = model.numbers()
+    omega = float(actuator.speed_at(n, actuator.voltage(n, duty)))
+    theta = float(actuator.static_angle(n, duty))
+    return State(float(actuator.current_at(n, omega)), omega, 0.0, 0.0 if math.isnan(theta) else theta, 0.0,
+                 float(actuator.thrust(n, omega)))
+
+
+def steps_in(model: Model, period: float) -> int:
+    """Into how many steps a hold of `period` s must be cut: 1 at the rig's period unless the plant is much faster."""
+    n, e = model.numbers(), values(model.effects)
+    top_speed = (abs(n["k0"]) + n["k1"] * math.sqrt(n["k2"] + n["k3"])) / n["K_e"]  # rad/s, never reached
+    back = n["K_t"] * n["K_e"] / (n["J_m"] * n["L_a"])  # 1/s²: the speed acts back on itself through the winding
+    rates = [1.0 / LONGEST_STEP,
+             min(math.sqrt(back / 0.04), back * n["L_a"] / (0.02 * n["R_a"])),
+             2.0 * n["k_load"] * top_speed / n["J_m"] / 0.1,
+             math.sqrt(n["mgd_over_J"]) / 0.3, n["c_over_J"] / 0.3]
+    if e is not None:
+        free = 1.0 - e.mast_flex_coupling
+        top_thrust = n["k_thrust"] * THRUST_PIVOT_SPEED**2 * (top_speed / THRUST_PIVOT_SPEED)**e.thrust_exponent_n
+        top_drive = n["mgd_over_J"] + n["L_over_J"] * top_thrust * (1.0 + max(0.0, e.ground_effect_gain))
+        damping = (n["c_over_J"] + n["L_over_J"] * e.axial_inflow_k * top_speed
+                   + 2.0 * math.sqrt(e.quadratic_drag_k * (top_drive + 4.0 * e.gust_sigma)))  # at terminal speed
+        rates += [math.sqrt((n["mgd_over_J"] + abs(e.cable_torque_k)) / free) / 0.3, damping / free / 0.3]
+        if e.mast_flex_coupling > 0.0:
+            rates += [e.mast_flex_omega / math.sqrt(free) / 0.3,
+                      2.0 * e.mast_flex_zeta * e.mast_flex_omega / free / 0.3]
+    return min(MOST_STEPS, math.ceil(period * max(rates) - 1e-9))
+
+
+def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0
+            ) -> tuple[Coefficients, Values | None, Extra | None]:
+    """What `run` needs of a model for holds of `period` seconds, cut into `steps` (0: as many as it takes)."""
+    n = model.numbers()
+    e = values(model.effects)
+    steps = steps or steps_in(model, period)
+    h = period / steps
+    resistance = n["R_a"] + (e.supply_sag_r_supply if e else 0.0)
+    c = Coefficients(steps, h, lag(resistance / n["L_a"], h), lag(n["B_m"] / n["J_m"], h), 1.0 / n["L_a"],
+                     n["K_e"], n["K_t"] / n["J_m"], n["k_load"] / n["J_m"], n["B_m"] / n["J_m"], n["k_thrust"],
+                     n["mgd_over_J"], n["c_over_J"], n["L_over_J"])
+    if e is None:
+        return c, None, None
+    air = lag(1.0 / e.thrust_lag_tau if e.thrust_lag_tau > NO_LAG * h else 0.0, h)
+    gust_decay = math.exp(-period / e.gust_tau)
+    return c, e, Extra(lag(1.0 / e.winding_heating_tau, h), air, n["R_a"], resistance, n["J_m"],
+                       gust_decay, e.gust_sigma * math.sqrt(1.0 - gust_decay**2), 1.0 / (1.0 - e.mast_flex_coupling),
+                       1.0 / e.ground_effect_width)
+
+
+class Trajectory(NamedTuple):
+    """States at the samples, each (N,), SI; `v_a` is the voltage at the motor's terminals as the hold begins.
+
+    `thrust` is the air's, before `ground_effect` and `axial_inflow`.
+    """
+
+    theta: Array
+    theta_dot: Array
+    i_a: Array
+    omega: Array
+    v_a: Array
+    rotor_angle: Array
+    thrust: Array
+
+
+@njit(cache=True, nogil=True)
+def run(v: Array, noise: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
+    """Record the state at the start of each hold in out (7, N), advance over it; return the state after the last."""
+    for k in range(v.shape[0]):
+        out[0, k], out[1, k], out[2, k], out[3, k] = state.theta, state.theta_dot, state.i_a, state.omega
+        out[5, k], out[6, k] = state.rotor_angle, state.thrust
+        if e is None:
+            out[4, k] = v[k]
+        else:
+            out[4, k] = v[k] - e.supply_sag_r_supply * state.i_a
+        for _ in range(c.steps):
+            state = advance(state, v[k], c, e, x)
+        if e is not None:
+            s = state
+            state = State(s.i_a, s.omega, s.rotor_angle, s.theta, s.theta_dot, s.thrust, s.heat, s.flex, s.flex_dot,
+                          x.gust_decay * s.gust + x.gust_kick * noise[k])
+    return state
+
+
+@njit(cache=True, nogil=True)
+def run_arm(speed: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
+    """Air and arm alone, for a given speed (N,), linear between samples; fills out (2, N) with θ, θ̇."""
+    for k in range(speed.shape[0]):
+        out[0, k], out[1, k] = state.theta, state.theta_dot
+        w = speed[k]
+        rise = (speed[min(k + 1, speed.shape[0] - 1)] - w) / c.steps
+        for _ in range(c.steps):
+            now = State(0.0, w, 0.0, state.theta, state.theta_dot, state.thrust, 0.0, state.flex, state.flex_dot, 0.0)
+            y, yd, f1, q, qd = advance_arm(now, w + 0.5 * rise, w + rise, c, e, x)
+            w += rise
+            state = State(0.0, w, 0.0, y, yd, f1, 0.0, q, qd, 0.0)
+    return state
+
+
+@njit(cache=True, nogil=True)
+def run_motor(v: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
+    """Winding and rotor alone, for the voltage at the terminals (N,), held; fills out (3, N) with i_a, ω, angle."""
+    for k in range(v.shape[0]):
+        out[0, k], out[1, k], out[2, k] = state.i_a, state.omega, state.rotor_angle
+        for _ in range(c.steps):
+            i1, _, w1, angle, heat = advance_motor(state, v[k], c, e, x)
+            state = State(i1, w1, angle, 0.0, 0.0, 0.0, heat, 0.0, 0.0, 0.0)
+    return state
+
+
+def simulate(model: Model, duty: Array, period: float = SAMPLE_PERIOD, state: State | None = None,
+             noise: Array | None = None, start: int = 0) -> Trajectory:
+    """Simulate the plant for a duty series, each value held for one period.
+
+    Args:
+        model: numbers and effects.
+        duty: (N,) 0..1.
+        period: s.
+        state: at the first sample; at rest by default.
+        noise: (N,) standard normal numbers for `gust`; none: no gust.
+        start: index of the first sample since the supply was fresh (for `supply_drift`).
+
+    Returns:
+        Trajectory of (N,) arrays at the N sample instants.
+    """
+    duty = np.ascontiguousarray(duty, dtype=float)
+    v, sampled = actuator.voltages(model.numbers(), duty, model.effects, period, start)
+    out = np.empty((7, len(duty)))
+    c, e, x = prepare(model, period)
+    run(v, np.zeros(len(duty)) if noise is None else noise, State() if state is None else state, c, e, x, out)
+    if "command_delay" in model.effects:
+        out[4] += sampled - v
+    return Trajectory(*out)
+
+
+LANES = 16
+"""Models that advance side by side in `squared_errors`."""
+
+_MAP, _STATE, _ERRORS, _VOLTAGE, _ROWS = 26, 30, 36, 40, 41
+
+
+@equation
+def _lane(a: Array, j: int) -> Coefficients:
+    n = LANES
+    return Coefficients(
+        1, a[j], Lag(a[n + j], a[2 * n + j], a[3 * n + j], a[4 * n + j], a[5 * n + j], a[6 * n + j], a[7 * n + j],
+                  a[8 * n + j]),
+        Lag(a[9 * n + j], a[10 * n + j], a[11 * n + j], a[12 * n + j], a[13 * n + j], a[14 * n + j], a[15 * n + j],
+            a[16 * n + j]),
+        a[17 * n + j], a[18 * n + j], a[19 * n + j], a[20 * n + j], a[21 * n + j], a[22 * n + j], a[23 * n + j],
+        a[24 * n + j], a[25 * n + j])
+
+
+@equation
+def _lane_state(a: Array, j: int) -> State:
+    n = LANES
+    return State(a[_STATE * n + j], a[(_STATE + 1) * n + j], 0.0, a[(_STATE + 3) * n + j], a[(_STATE + 4) * n + j],
+                 a[(_STATE + 5) * n + j], 0.0, 0.0, 0.0, 0.0)
+
+
+@equation
+def _advance_lane(a: Array, j: int, x: State, v: float) -> None:
+    n = LANES
+    y = advance(x, v, _lane(a, j), None, None)
+    a[_STATE * n + j] = y.i_a
+    a[(_STATE + 1) * n + j] = y.omega
+    a[(_STATE + 3) * n + j] = y.theta
+    a[(_STATE + 4) * n + j] = y.theta_dot
+    a[(_STATE + 5) * n + j] = y.thrust
+
+
+@njit(cache=True, parallel=True)
+def _squared_errors(duty: Array, measured: Array, steps: int, table: Array) -> None:
+    """One row of `table` is a block of models: row r of model j is at r LANES + j, so that lanes are SIMD lanes."""
+    n = LANES
+    for block in prange(table.shape[0]):
+        a = table[block]
+        for k in range(duty.shape[0]):
+            if k == 0 or duty[k] != duty[k - 1]:
+                for j in range(n):
+                    root = math.sqrt(a[(_MAP + 2) * n + j] * duty[k] + a[(_MAP + 3) * n + j])
+                    a[_VOLTAGE * n + j] = max(0.0, a[_MAP * n + j] + a[(_MAP + 1) * n + j] * root)
+            m0, m1, m2, m3 = measured[0, k], measured[1, k], measured[2, k], measured[3, k]
+            for j in range(n):
+                v = a[_VOLTAGE * n + j]
+                x = _lane_state(a, j)
+                a[_ERRORS * n + j] += (x.theta - m0) * (x.theta - m0)
+                a[(_ERRORS + 1) * n + j] += (x.omega - m1) * (x.omega - m1)
+                a[(_ERRORS + 2) * n + j] += (x.i_a - m2) * (x.i_a - m2)
+                a[(_ERRORS + 3) * n + j] += (v - m3) * (v - m3)
+                _advance_lane(a, j, x, v)
+            for _ in range(steps - 1):
+                for j in range(n):
+                    _advance_lane(a, j, _lane_state(a, j), a[_VOLTAGE * n + j])
+
+
+def squared_errors(models: Sequence[Model], duty: Array, measured: Array, period: float = SAMPLE_PERIOD,
+                   states: Sequence[State] | None = None) -> Array:
+    """Sums of squared errors of many nominal models against one recording, on every core.
+
+    Args:
+        models: M models; of their effects only `parameter_mismatch` is allowed.
+        duty: (N,) 0..1, held.
+        measured: (4, N) θ, ω, i_a, v_a, without NaN.
+        period: s.
+        states: M states at the first sample; at rest by default.
+
+    Returns:
+        (M, 4) sums over the samples.
+
+    Raises:
+        ValueError: a model has effects.
+    """
+    if any(id_ != PARAMETER_MISMATCH and is_active(id_, p) for model in models for id_, p in model.effects.items()):
+        raise ValueError("squared_errors simulates nominal models only; use simulate for effects")
+    blocks = -(-len(models) // LANES)
+    steps = max((steps_in(model, period) for model in models), default=1)
+    rows = np.zeros((blocks * LANES, _ROWS))
+    for j in range(len(rows)):
+        m = min(j, len(models) - 1)  # the last block is filled up with the last model
+        numbers = models[m].numbers()
+        c = prepare(models[m], period, steps)[0]
+        rows[j, :_STATE] = [c.h, *c.winding, *c.rotor, *c[4:], *(numbers[key] for key in ("k0", "k1", "k2", "k3"))]
+        rows[j, _STATE:_ERRORS] = (states[m] if states is not None else State())[:6]
+    table = np.ascontiguousarray(rows.reshape(blocks, LANES, _ROWS).transpose(0, 2, 1)).reshape(blocks, _ROWS * LANES)
+    _squared_errors(np.ascontiguousarray(duty, dtype=float), np.ascontiguousarray(measured, dtype=float), steps, table)
+    errors = table.reshape(blocks, _ROWS, LANES)[:, _ERRORS:_VOLTAGE]
+    return errors.transpose(0, 2, 1).reshape(-1, 4)[:len(models)]

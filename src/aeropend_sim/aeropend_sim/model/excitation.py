@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Duty signals that make a rig show what it is made of. Pure: settings in, one array out."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeropend_sim.model.parameters import SAMPLE_PERIOD
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """One duty signal. Fields that a kind has no use for are ignored by it.
+
+    Attributes:
+        kind: one of `KINDS`.
+        duration: length of the signal, s.
+        seed: the same seed gives the same signal.
+        duty_min: least duty of latin_hypercube, staircase and multisine, 0..1.
+        duty_max: greatest duty of the same.
+        hold_min: shortest hold of latin_hypercube, s.
+        hold_max: longest hold of latin_hypercube; how long steps holds each duty and free_decay lifts, s.
+        levels: intervals of the Latin hypercube; stairs of staircase.
+        rest: duty 0 after each Latin hypercube and after each lift of free_decay, s.
+        duty: of hold and free_decay, 0..1.
+        sequence: duties of steps, repeated, 0..1.
+        frequencies: of multisine, Hz.
+
+    Raises:
+        ValueError: on fields that contradict each other, in one line.
+    """
+
+    kind: str = "latin_hypercube"
+    duration: float = 60.0
+    seed: int = 0
+    duty_min: float = 0.0
+    duty_max: float = 0.6
+    hold_min: float = 0.2
+    hold_max: float = 2.0
+    levels: int = 10
+    rest: float = 3.0
+    duty: float = 0.45
+    sequence: tuple[float, ...] = (0.0, 0.4314)
+    frequencies: tuple[float, ...] = (0.11, 0.23, 0.37, 0.61, 0.97, 1.57, 2.51, 4.07)
+
+    def __post_init__(self) -> None:
+        nyquist = 0.5 / SAMPLE_PERIOD
+        for wrong, message in (
+            (self.kind not in KINDS, f"kind is '{self.kind}': give one of {', '.join(KINDS)}"),
+            (self.duration < SAMPLE_PERIOD, f"duration is {self.duration:g} s: give at least one sample, 0.00204 s"),
+            (
+                not 0.0 <= self.duty_min < self.duty_max <= 1.0,
+                f"duty_min {self.duty_min:g} and duty_max {self.duty_max:g}: give 0 <= duty_min < duty_max <= 1",
+            ),
+            (
+                not SAMPLE_PERIOD <= self.hold_min <= self.hold_max,
+                f"hold_min {self.hold_min:g} s and hold_max {self.hold_max:g} s: give 0.00204 <= hold_min <= hold_max",
+            ),
+            (self.levels < 2, f"levels is {self.levels}: give at least 2"),
+            (self.rest < 0.0, f"rest is {self.rest:g} s: give 0 or more"),
+            (not 0.0 <= self.duty <= 1.0, f"duty is {self.duty:g}: give 0 to 1"),
+            (
+                not self.sequence or not all(0.0 <= duty <= 1.0 for duty in self.sequence),
+                "sequence: give at least one duty, each 0 to 1",
+            ),
+            (
+                not self.frequencies or not all(0.0 < frequency < nyquist for frequency in self.frequencies),
+                f"frequencies: give at least one, each above 0 and below {nyquist:.0f} Hz",
+            ),
+        ):
+            if wrong:
+                raise ValueError(message)
+
+    def series(self) -> Array:
+        """Return the duty at each sample, (N,), 0..1, each held for one `SAMPLE_PERIOD`."""
+        return KINDS[self.kind](self)
+
+    @property
+    def samples(self) -> int:
+        """N, the number of samples."""
+        return max(1, round(self.duration / SAMPLE_PERIOD))
+
+
+def _held(holds: list[tuple[float, float]], samples: int) -> Array:
+    """Sample (duty, seconds) holds; the last one is prolonged."""
+    duties = np.array([duty for duty, _ in holds])
+    ends = np.cumsum([seconds for _, seconds in holds])
+    at = np.searchsorted(ends, (np.arange(samples) + 0.5) * SAMPLE_PERIOD)
+    return duties[np.minimum(at, len(duties) - 1)]
+
+
+def latin_hypercube(x: Excitation) -> Array:
+    """Holds drawn from a Latin hypercube over (duty, hold time), thesis section 5.1.
+
+    Both ranges are cut into `levels` intervals; each interval of either is used once, in random pairs and order. Then
+    the duty rests at 0, so that the arm also swings freely, and the next hypercube is drawn, until the time is over.
+    """
+    rng = np.random.default_rng(x.seed)
+    holds: list[tuple[float, float]] = []
+    total = 0.0
+    while total < x.duration:
+        strata = np.stack([rng.permutation(x.levels), rng.permutation(x.levels)])
+        share = (strata + rng.random((2, x.levels))) / x.levels
+        duties = x.duty_min + share[0] * (x.duty_max - x.duty_min)
+        seconds = x.hold_min + share[1] * (x.hold_max - x.hold_min)
+        holds += [*zip(duties.tolist(), seconds.tolist(), strict=True), (0.0, x.rest)]
+        total += float(seconds.sum()) + x.rest
+    return _held(holds, x.samples)
+
+
+def steps(x: Excitation) -> Array:
+    """`sequence`, each duty for `hold_max` seconds, again and again."""
+    repeats = math.ceil(x.duration / (x.hold_max * len(x.sequence)))
+    return _held([(duty, x.hold_max) for duty in x.sequence] * repeats, x.samples)
+
+
+def staircase(x: Excitation) -> Array:
+    """From `duty_min` to `duty_max` and back in equal stairs that fill the duration; `levels` different duties."""
+    up = np.linspace(x.duty_min, x.duty_max, x.levels).tolist()
+    stairs = up + up[-2::-1]
+    return _held([(duty, x.duration / len(stairs)) for duty in stairs], x.samples)
+
+
+def multisine(x: Excitation) -> Array:
+    """Sines of equal amplitude that together fill `duty_min`..`duty_max`.
+
+    Of 100 sets of random phases, the one with the least peak for its power is taken.
+    """
+    rng = np.random.default_rng(x.seed)
+    t = np.arange(x.samples) * SAMPLE_PERIOD
+    angles = 2.0 * np.pi * np.outer(x.frequencies, t)
+    cosines, sines = np.cos(angles), np.sin(angles)
+    best = np.zeros(x.samples)
+    for phases in rng.uniform(0.0, 2.0 * np.pi, (100, len(x.frequencies))):
+        signal = np.cos(phases) @ sines + np.sin(phases) @ cosines
+        if not best.any() or np.ptp(signal) < np.ptp(best):
+            best = signal
+    best = best - best.min()
+    return x.duty_min + best * ((x.duty_max - x.duty_min) / max(best.max(), np.finfo(float).tiny))
+
+
+def free_decay(x: Excitation) -> Array:
+    """Lift with `duty` for `hold_max` seconds, then let go for `rest` seconds, again and again."""
+    repeats = math.ceil(x.duration / (x.hold_max + x.rest))
+    return _held([(x.duty, x.hold_max), (0.0, x.rest)] * repeats, x.samples)
+
+
+def hold(x: Excitation) -> Array:
+    """`duty` all the time."""
+    return np.full(x.samples, x.duty)
+
+
+KINDS: dict[str, Callable[[Excitation], Array]] = {
+    function.__name__: function for function in (latin_hypercube, steps, staircase, multisine, free_decay, hold)
+}
+"""Every kind of signal by name."""

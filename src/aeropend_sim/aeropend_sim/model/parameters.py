@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The numbers of the model: names, units, ranges, presets, and the ROS 2 parameter files that hold them."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import tempfile
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+
+import yaml
+
+from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
+from aeropend_sim.untrusted import load_yaml, one_line, printable
+
+SAMPLE_PERIOD = 64 * 510 / 16e6
+"""Sample period in s: Timer1 of a 16 MHz ATmega2560, 8-bit phase-correct PWM, prescaler 64 (thesis 4.3.2)."""
+
+PRESETS = ("bench", "thesis")
+
+SECTIONS = ("model", "sensing", "effects")
+"""The parts of a model file; a node's own parameters may stand beside them."""
+
+
+class ModelError(ValueError):
+    """A model file, a preset or a number that cannot be used; the message is one line for a person."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(one_line(text))
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """What a number of the model is: its unit, the range that makes sense, and what it means."""
+
+    unit: str
+    low: float
+    high: float
+    description: str
+
+
+_P = Parameter
+PARAMETERS: dict[str, Parameter] = {
+    "model.k0": _P("V", -10.0, 10.0, "duty map: v = max(0, k0 + k1 sqrt(k2 τ + k3)), thesis (4.3)"),
+    "model.k1": _P("V", 0.0, 10.0, "duty map: factor of the root"),
+    "model.k2": _P("-", 0.0, 1e12, "duty map: factor of the duty under the root"),
+    "model.k3": _P("-", 0.0, 1e12, "duty map: constant under the root"),
+    "model.R_a": _P("Ω", 1e-3, 1e3, "armature resistance"),
+    "model.L_a": _P("H", 1e-7, 10.0, "armature inductance"),
+    "model.K_e": _P("V·s/rad", 1e-6, 10.0, "back-EMF constant"),
+    "model.K_t": _P("N·m/A", 1e-6, 10.0, "torque constant"),
+    "model.J_m": _P("kg·m²", 1e-9, 1.0, "inertia of rotor, gear and propeller"),
+    "model.B_m": _P("N·m·s/rad", 0.0, 10.0, "viscous friction of the rotor"),
+    "model.k_load": _P("N·m·s²/rad²", 0.0, 1.0, "air torque of the propeller: k_load ω|ω|"),
+    "model.k_thrust": _P("N·s²/rad²", 0.0, 10.0, "thrust: f = k_thrust ω|ω|"),
+    "model.mgd_over_J": _P("1/s²", 0.0, 1e4, "gravity on the arm over its inertia"),
+    "model.c_over_J": _P("1/s", 0.0, 1e3, "viscous friction of the pivot over the arm's inertia"),
+    "model.L_over_J": _P("1/(kg·m)", 0.0, 1e5, "lever of the thrust over the arm's inertia"),
+    "sensing.angle_lsb": _P("rad", 0.0, 1.0, "resolution of the angle; 0 = continuous"),
+    "sensing.angle_filter_tau": _P("s", 0.0, 1.0, "each of two equal first-order stages of the angle filter; 0 = none"),
+    "sensing.angle_noise": _P("rad", 0.0, 1.0, "standard deviation before quantisation"),
+    "sensing.current_lsb": _P("A", 0.0, 10.0, "resolution of the current; 0 = continuous"),
+    "sensing.current_noise": _P("A", 0.0, 10.0, "standard deviation before quantisation"),
+    "sensing.voltage_lsb": _P("V", 0.0, 10.0, "resolution of the voltage; 0 = continuous"),
+    "sensing.voltage_noise": _P("V", 0.0, 10.0, "standard deviation before quantisation"),
+    "sensing.speed_pulses_per_rev": _P("-", 0.0, 1e4, "pulses a revolution; 0 = the speed is sampled directly"),
+    "sensing.speed_tick": _P("s", 0.0, 0.1, "resolution of the pulse times; 0 = continuous"),
+    "sensing.speed_noise": _P("rad/s", 0.0, 1e3, "standard deviation of a speed read"),
+}
+"""Every number of a model file outside `effects`, as `section.name`."""
+
+MODEL_NAMES = tuple(key[len("model."):] for key in PARAMETERS if key.startswith("model."))
+SENSING_NAMES = tuple(key[len("sensing."):] for key in PARAMETERS if key.startswith("sensing."))
+
+
+@dataclass(frozen=True)
+class Model:
+    """A complete model: the plant's numbers, the measurement chain's, and the active effects, all SI.
+
+    `model` and `sensing` hold every name of `PARAMETERS`; `effects` maps an effect's id to all of its parameters.
+    """
+
+    name: str
+    model: Mapping[str, float]
+    sensing: Mapping[str, float]
+    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    def numbers(self) -> dict[str, float]:
+        """The plant's numbers with `parameter_mismatch` applied."""
+        return {**self.model, **self.effects.get(PARAMETER_MISMATCH, {})}
+
+    def with_effects(self, effects: Mapping[str, Mapping[str, float]]) -> Model:
+        """The same model with these effects in place of its own."""
+        return Model(self.name, self.model, self.sensing, effects)
+
+
+def _number(key: str, value: object, low: float, high: float, unit: str, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ModelError(f"{where}: {key} is {value!r}; give a number" + (f" in {unit}" if unit != "-" else ""))
+    if not low <= value <= high:
+        size = f"{value:g} {unit}" if unit != "-" else f"{value:g}"
+        raise ModelError(f"{where}: {key} = {size} is out of range; give {low:g} to {high:g}")
+    return float(value)
+
+
+def _unknown(what: str, key: str, known: Mapping[str, object] | tuple[str, ...], where: str) -> ModelError:
+    near = difflib.get_close_matches(key, list(known), n=1)
+    hint = f"did you mean {near[0]}?" if near else "known: " + ", ".join(known)
+    return ModelError(f"{where}: unknown {what} '{key}'; {hint}")
+
+
+def from_flat(flat: Mapping[str, object], name: str = "model", base: Model | None = None) -> Model:
+    """Build a model from dotted names, e.g. `model.R_a`, `effects.coulomb_friction.accel`.
+
+    Args:
+        flat: dotted name -> number. An effect's missing parameters take the catalogue's defaults.
+        name: what messages call the source of these numbers, usually the file.
+        base: supplies what `flat` leaves out; without it every `model.*` and `sensing.*` name must be given.
+
+    Raises:
+        ModelError: unknown name, not a number, out of range, or missing.
+    """
+    numbers: dict[str, float] = {}
+    effects: dict[str, dict[str, float]] = {}
+    if base is not None:
+        numbers = {f"{section}.{key}": value for section in ("model", "sensing")
+                   for key, value in getattr(base, section).items()}
+        effects = {id_: dict(parameters) for id_, parameters in base.effects.items()}
+    for key, value in flat.items():
+        section, _, rest = key.partition(".")
+        if key in SECTIONS:
+            raise ModelError(f"{name}: '{key}' is {value!r}; give its numbers by name, one a line")
+        if section == "effects":
+            _read_effect(effects, rest, value, name)
+        elif key in PARAMETERS:
+            p = PARAMETERS[key]
+            numbers[key] = _number(key, value, p.low, p.high, p.unit, name)
+        else:
+            raise _unknown("parameter", key, tuple(PARAMETERS), name)
+    missing = [key for key in PARAMETERS if key not in numbers]
+    if missing:
+        raise ModelError(f"{name}: {missing[0]} is missing ({len(missing)} in all); "
+                         "a model file gives every number that the presets give")
+    for id_, parameters in effects.items():
+        if id_ != PARAMETER_MISMATCH:
+            for key, q in CATALOGUE[id_].parameters.items():
+                parameters.setdefault(key, q.default)
+    return Model(name, {n: numbers[f"model.{n}"] for n in MODEL_NAMES},
+                 {n: numbers[f"sensing.{n}"] for n in SENSING_NAMES}, effects)
+
+
+def _read_effect(effects: dict[str, dict[str, float]], rest: str, value: object, where: str) -> None:
+    id_, _, parameter = rest.partition(".")
+    known = (*CATALOGUE, PARAMETER_MISMATCH)
+    if id_ not in known:
+        raise _unknown("effect", id_, known, where)
+    if not parameter:
+        example = "R_a: 1.2" if id_ == PARAMETER_MISMATCH else (
+            f"{CATALOGUE[id_].size}: {CATALOGUE[id_].parameters[CATALOGUE[id_].size].default:g}")
+        raise ModelError(f"{where}: effects.{id_} has no parameter; give at least one, as in {id_}: {{{example}}}")
+    if id_ == PARAMETER_MISMATCH:
+        key = f"model.{parameter}"
+        if key not in PARAMETERS:
+            raise _unknown("number in parameter_mismatch", parameter, MODEL_NAMES, where)
+        p = PARAMETERS[key]
+        effects.setdefault(id_, {})[parameter] = _number(f"effects.{rest}", value, p.low, p.high, p.unit, where)
+        return
+    if parameter not in CATALOGUE[id_].parameters:
+        raise _unknown(f"parameter of {id_}", parameter, tuple(CATALOGUE[id_].parameters), where)
+    q = CATALOGUE[id_].parameters[parameter]
+    effects.setdefault(id_, {})[parameter] = _number(f"effects.{rest}", value, q.low, q.high, q.unit, where)
+
+
+def to_flat(model: Model) -> dict[str, float]:
+    """The inverse of `from_flat`: dotted name -> number."""
+    flat = {f"model.{key}": value for key, value in model.model.items()}
+    flat.update({f"sensing.{key}": value for key, value in model.sensing.items()})
+    flat.update({f"effects.{id_}.{key}": value
+                 for id_, parameters in model.effects.items() for key, value in parameters.items()})
+    return flat
+
+
+def flatten(tree: Mapping[str, object], prefix: str = "") -> dict[str, object]:
+    """Nested mappings to dotted names; an empty section (as in `effects: {}`) adds nothing."""
+    flat: dict[str, object] = {}
+    for key, value in tree.items():
+        if isinstance(value, Mapping) and value:
+            flat.update(flatten(value, f"{prefix}{key}."))
+        elif value or value == 0 or prefix or key not in SECTIONS:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def load(source: str | Path) -> Model:
+    """Read a preset (`bench`, `thesis`) or a model file.
+
+    Keys of a node's own that are not the model's (anything outside `model`, `sensing`, `effects`) are left to the node.
+
+    Raises:
+        ModelError: no such preset or file, not a ROS 2 parameter file, or a number in it is unusable.
+    """
+    if str(source) in PRESETS:
+        name, text = str(source), (files("aeropend_sim") / "config" / f"{source}.yaml").read_text(encoding="utf-8")
+    else:
+        name = str(source)
+        try:
+            text = Path(source).read_text(encoding="utf-8")
+        except FileNotFoundError:
+            raise ModelError(f"{source}: no such model file; give a file or a preset ({', '.join(PRESETS)})") from None
+        except (OSError, UnicodeDecodeError) as error:
+            reason = getattr(error, "strerror", None) or "not a text file"
+            raise ModelError(f"{source}: the model file cannot be read: {reason}") from None
+    try:
+        tree = load_yaml(text, _Loader)
+    except yaml.MarkedYAMLError as error:
+        line = f" at line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise ModelError(f"{name}: not valid YAML{line}: {error.problem}; see the presets for the form") from None
+    except yaml.YAMLError:
+        raise ModelError(f"{name}: not a model file; see the presets for the form") from None
+    return from_flat(_node_parameters(tree, name), name)
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads numbers as rcl does (1e-5 is one, which YAML 1.1 takes for text), and no key twice."""
+
+    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 - PyYAML's own
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, object]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            name = str(key.value)
+            if name in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"{name} is given twice", key.start_mark)
+            seen.add(name)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$"),
+    list("-+.0123456789"))
+_Loader.add_implicit_resolver("tag:yaml.org,2002:null", re.compile(r"~$|null$|Null$|NULL$|$"), ["~", "n", "N", ""])
+
+
+def _node_parameters(tree: object, name: str) -> dict[str, object]:
+    sections = tree.values() if isinstance(tree, Mapping) else ()
+    found = [s["ros__parameters"] for s in sections if isinstance(s, Mapping) and "ros__parameters" in s]
+    if len(found) != 1 or not isinstance(found[0], Mapping):
+        raise ModelError(f"{name}: not a model file; it starts with '/**:' and 'ros__parameters:' (see the presets)")
+    mine: dict[str, object] = {}
+    for key, value in found[0].items():
+        section, dot, _ = str(key).partition(".")
+        if section in SECTIONS:
+            mine[str(key)] = value
+        elif (dot or isinstance(value, Mapping)) and difflib.get_close_matches(section, SECTIONS, cutoff=0.7):
+            raise _unknown("section", section, SECTIONS, name)
+    return flatten(mine)
+
+
+def save(model: Model, path: str | Path, comment: str = "") -> None:
+    """Write a model file that the plant node and `load` read alike; replaces `path` in one step.
+
+    Args:
+        model: what to write; its `name` is not written.
+        path: the file.
+        comment: lines put at the top, each behind `# `.
+
+    Raises:
+        ModelError: the file cannot be written; what was there before is untouched.
+    """
+    tree: dict[str, object] = {"model": dict(model.model), "sensing": dict(model.sensing)}
+    if model.effects:  # rcl's parser refuses an empty mapping
+        tree["effects"] = {id_: dict(parameters) for id_, parameters in model.effects.items()}
+    head = "".join(f"# {printable(line)}\n" for line in comment.splitlines())
+    text = head + yaml.dump({"/**": {"ros__parameters": tree}}, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+    path = Path(path)
+    temporary = None
+    try:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name)
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+        Path(temporary).chmod(0o644)
+        Path(temporary).replace(path)
+    except BaseException as error:
+        if temporary is not None:
+            Path(temporary).unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise ModelError(f"{path}: the model file cannot be written: {error.strerror}") from None
+        raise
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes floats so that YAML 1.1 and rcl read them back as floats, to the last bit."""
+
+
+def _represent_float(dumper: yaml.SafeDumper, value: float) -> yaml.ScalarNode:
+    text = repr(float(value))
+    if "e" in text and "." not in text:
+        text = text.replace("e", ".0e")
+    return dumper.represent_scalar("tag:yaml.org,2002:float", text)
+
+
+_Dumper.add_representer(float, _represent_float)

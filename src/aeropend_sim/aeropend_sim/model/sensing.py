@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the rig reports of a state: angle filter, quantisation, pulse-timed speed, noise, and the effects of sensing.
+
+Order of the chain: the encoder's error (`angle_offset`, `encoder_eccentricity`), the two-stage filter (`encoder_lag`
+makes it slower), noise, quantisation; for the current gain, offset, noise, quantisation; for the speed the time between
+pulses (`speed_spikes` falsify it).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from aeropend_sim.model.dynamics import NO_LAG, Lag, lag
+from aeropend_sim.model.effects import SPIKE_FACTOR
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+
+Array = NDArray[np.float64]
+
+SPEED_TIMEOUT = 0.5
+"""s without a pulse after which the speed reads 0 (contract section 3)."""
+
+
+class Chain(NamedTuple):
+    """The measurement chain of a model, precomputed for one sample period; SI."""
+
+    h: float
+    filter: Lag
+    filter_rate: float
+    bias: float
+    amplitude: float
+    phase: float
+    angle_noise: float
+    angle_lsb: float
+    current_factor: float
+    current_bias: float
+    current_noise: float
+    current_lsb: float
+    voltage_bias: float
+    voltage_noise: float
+    voltage_lsb: float
+    pulses: float
+    tick: float
+    speed_noise: float
+    spike_rate: float
+
+
+class Memory(NamedTuple):
+    """What the chain remembers from sample to sample."""
+
+    stage1: float
+    stage2: float
+    theta: float
+    theta_dot: float
+    omega: float
+    rotor_angle: float
+    last_pulse: float
+    speed: float
+    time: float
+
+
+def prepare(model: Model, period: float = SAMPLE_PERIOD) -> Chain:
+    """What `read` needs of a model for samples `period` seconds apart."""
+    s, e = model.sensing, model.effects
+
+    def effect(id_: str, name: str) -> float:
+        parameters: Mapping[str, float] = e.get(id_, {})
+        return float(parameters.get(name, 0.0))
+
+    tau = s["angle_filter_tau"] + effect("encoder_lag", "tau")
+    rate = 1.0 / tau if tau > NO_LAG * period else 0.0
+    return Chain(period, lag(rate, period), rate, effect("angle_offset", "bias"),
+                 effect("encoder_eccentricity", "amplitude"), effect("encoder_eccentricity", "phase"),
+                 s["angle_noise"], s["angle_lsb"], 1.0 + effect("current_gain", "gain"),
+                 effect("current_offset", "bias"), s["current_noise"], s["current_lsb"],
+                 effect("voltage_offset", "bias"), s["voltage_noise"], s["voltage_lsb"],
+                 s["speed_pulses_per_rev"], s["speed_tick"], s["speed_noise"],
+                 effect("speed_spikes", "rate"))
+
+
+@njit(cache=True)
+def _encoder(theta: float, c: Chain) -> float:
+    angle = theta + c.bias
+    return angle + c.amplitude * math.sin(theta + c.phase) if c.amplitude != 0.0 else angle
+
+
+@njit(cache=True)
+def start(theta: float, theta_dot: float, omega: float, rotor_angle: float, c: Chain) -> Memory:
+    """The chain at rest at an angle, as long ago settled."""
+    angle = _encoder(theta, c)
+    return Memory(angle, angle, theta, theta_dot, omega, rotor_angle, math.nan, math.nan, 0.0)
+
+
+@njit(cache=True)
+def _quantise(x: float, lsb: float) -> float:
+    return lsb * math.floor(x / lsb + 0.5) if lsb > 0.0 else x
+
+
+@njit(cache=True)
+def filter_angle(m: Memory, theta: float, theta_dot: float, c: Chain) -> tuple[float, float]:
+    """Both stages of the angle filter over one period, the angle between the samples by its Hermite cubic."""
+    now = _encoder(theta, c)
+    if c.filter_rate == 0.0:
+        return now, now
+    before = _encoder(m.theta, c)
+    middle = _encoder(0.5 * (m.theta + theta) + 0.125 * c.h * (m.theta_dot - theta_dot), c)
+    k, a = c.filter, c.filter_rate
+    half = k.half_decay * m.stage1 + a * (k.u0 * before + k.u1 * middle + k.u2 * now)
+    stage1 = k.decay * m.stage1 + a * (k.w0 * before + k.w1 * middle + k.w2 * now)
+    stage2 = k.decay * m.stage2 + a * (k.w0 * m.stage1 + k.w1 * half + k.w2 * stage1)
+    return stage1, stage2
+
+
+@njit(cache=True, nogil=True)
+def angle_reading(theta: Array, theta_dot: Array, c: Chain) -> Array:
+    """The angle (N,) that the encoder and its filter give for a motion (N,), before noise and quantisation."""
+    out = np.empty(theta.shape[0])
+    m = start(theta[0], theta_dot[0], 0.0, 0.0, c)
+    for k in range(theta.shape[0]):
+        if k > 0:
+            stage1, stage2 = filter_angle(m, theta[k], theta_dot[k], c)
+            m = Memory(stage1, stage2, theta[k], theta_dot[k], 0.0, 0.0, 0.0, 0.0, 0.0)
+        out[k] = m.stage2
+    return out
+
+
+@njit(cache=True)
+def time_pulses(m: Memory, omega: float, rotor_angle: float, uniform: Array, normal: float, c: Chain
+                ) -> tuple[float, float, float]:
+    """Last pulse (s), held speed (rad/s) and this instant (s), after the pulses since the last sample."""
+    now = m.time + c.h
+    last, speed = m.last_pulse, m.speed
+    step = 2.0 * math.pi / c.pulses
+    pulse = math.floor(m.rotor_angle / step) + 1.0
+    while pulse * step <= rotor_angle:
+        ahead = pulse * step - m.rotor_angle
+        slope = (omega - m.omega) / c.h
+        root = math.sqrt(max(m.omega * m.omega + 2.0 * slope * ahead, 0.0))
+        since = 2.0 * ahead / (m.omega + root) if m.omega + root > 0.0 else c.h
+        at = m.time + min(max(since, 0.0), c.h)
+        if c.tick > 0.0:
+            at = c.tick * math.floor(at / c.tick)
+        if not math.isnan(last) and at > last:
+            speed = step / (at - last)
+            if uniform[0] < -math.expm1(-c.spike_rate * (at - last)):
+                speed *= SPIKE_FACTOR[0] + (SPIKE_FACTOR[1] - SPIKE_FACTOR[0]) * uniform[1]
+            speed += c.speed_noise * normal
+        last = at
+        pulse += 1.0
+    if now - last > SPEED_TIMEOUT:
+        speed = 0.0
+    return last, speed, now
+
+
+@njit(cache=True, nogil=True)
+def read(out: Array, truth: Array, normal: Array, uniform: Array, m: Memory, first: bool, c: Chain) -> Memory:
+    """Read N states in sequence.
+
+    Args:
+        out: (4, N), filled with θ, ω, i_a, v_a as read; ω is 0 before two pulses.
+        truth: (7, N) as `dynamics.run` fills it.
+        normal: (N, 4) standard normal numbers; uniform: (N, 2) in 0..1.
+        m: the chain's memory; first: it has read nothing yet.
+        c: the chain.
+
+    Returns:
+        The memory after the last sample.
+    """
+    for k in range(out.shape[1]):
+        theta, theta_dot, i_a, omega, v_a, angle = (truth[0, k], truth[1, k], truth[2, k], truth[3, k], truth[4, k],
+                                                    truth[5, k])
+        if first:
+            m = start(theta, theta_dot, omega, angle, c)
+            first = False
+        else:
+            last, speed, now = m.last_pulse, m.speed, m.time + c.h
+            if c.pulses > 0.0:
+                last, speed, now = time_pulses(m, omega, angle, uniform[k], normal[k, 1], c)
+            stage1, stage2 = filter_angle(m, theta, theta_dot, c)
+            m = Memory(stage1, stage2, theta, theta_dot, omega, angle, last, speed, now)
+        out[0, k] = _quantise(m.stage2 + c.angle_noise * normal[k, 0], c.angle_lsb)
+        if c.pulses > 0.0:
+            out[1, k] = 0.0 if math.isnan(m.speed) else m.speed
+        else:
+            out[1, k] = omega + c.speed_noise * normal[k, 1]
+            if uniform[k, 0] < -math.expm1(-c.spike_rate * c.h):
+                out[1, k] *= SPIKE_FACTOR[0] + (SPIKE_FACTOR[1] - SPIKE_FACTOR[0]) * uniform[k, 1]
+        out[2, k] = _quantise(c.current_factor * i_a + c.current_bias + c.current_noise * normal[k, 2], c.current_lsb)
+        out[3, k] = _quantise(v_a + c.voltage_bias + c.voltage_noise * normal[k, 3], c.voltage_lsb)
+    return m
+
+
+NOTHING_READ = Memory(*(math.nan,) * 9)
+"""The memory before the first sample."""

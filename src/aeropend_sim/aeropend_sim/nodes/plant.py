@@ -1,0 +1,355 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated rig as a ROS 2 node, with the topics, services and rate of the real one.
+
+Time. A thread of its own takes a sample every 2.040 ms, on absolute deadlines. Stamps are the deadlines, not the
+instants at which the thread woke, so they lie on an exact grid. A sample that is taken when the next one is already due
+counts as late; it is published all the same, and the thread catches up back to back. Only when the process stood still
+for more than `BACKLOG` samples are the older ones not published: the rig is moved on through them, so that its time
+stays equal to ROS time, and they count as lost, as on a real rig nobody listened to. When the system clock is set, the
+grid moves by whole periods and a warning says so.
+
+Faster than real time (`speed` not 1), stamps are simulated time, which starts one period after 0, and `/clock` carries
+it before each sample. No sample is left out: simulated time runs slower than asked instead. Nothing waits for
+listeners, though: one that is too slow for the speed loses samples, and the stamps show it.
+
+Every parameter is read at start and fixed while the node runs: a recording belongs to one model.
+"""
+
+import ctypes
+import math
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from rclpy.node import Node
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import BatteryState, JointState
+from std_msgs.msg import Float64
+from std_srvs.srv import SetBool, Trigger
+
+from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
+from aeropend_sim.model.parameters import (
+    MODEL_NAMES,
+    PARAMETERS,
+    PRESETS,
+    SAMPLE_PERIOD,
+    Model,
+    ModelError,
+    from_flat,
+    load,
+    to_flat,
+)
+from aeropend_sim.ros import interface
+from aeropend_sim.ros.program import (
+    Diagnostics,
+    Setting,
+    UserError,
+    Worker,
+    declare,
+    overrides,
+    read_settings,
+    run,
+    usage,
+)
+from aeropend_sim.ros.realtime import CLOCK_STEP_NS, go_before_other_programs, monotonic_to_ros_ns, prepare_thread
+
+PERIOD_NS = round(SAMPLE_PERIOD * 1e9)
+BACKLOG = 49
+"""How many samples late the thread may be and still publish them all: 100 ms."""
+
+SETTINGS = {
+    "preset": Setting("bench", "model that supplies every number not given", choices=PRESETS),
+    "seed": Setting(0, "seed of noise and gusts", low=0, high=2**31 - 1),
+    "speed": Setting(
+        1.0, "simulated over real time; not 1: publishes /clock; 0: as fast as it goes", low=0.0, high=1e3
+    ),
+    "publish_truth": Setting(False, "publish truth/joint_states and truth/armature"),
+}
+
+def _setting(name: str) -> Setting:
+    """Describe one number of a model file, by its full name."""
+    section, _, rest = name.partition(".")
+    if section == "effects":
+        effect, _, key = rest.partition(".")
+        if effect != PARAMETER_MISMATCH:
+            q = CATALOGUE[effect].parameters[key]
+            return Setting(q.default, f"{CATALOGUE[effect].physics}: {q.description}", q.unit, q.low, q.high)
+        name = f"model.{key}"
+    p = PARAMETERS[name]
+    return Setting(p.low, p.description, p.unit, p.low, p.high)
+
+
+NUMBERS = [
+    *PARAMETERS,
+    *(f"effects.{effect.id}.{key}" for effect in CATALOGUE.values() for key in effect.parameters),
+    *(f"effects.{PARAMETER_MISMATCH}.{key}" for key in MODEL_NAMES),
+]
+"""The full name of every number that a model file may hold."""
+
+USAGE = usage(
+    "plant: the simulated aeropendulum. Publishes joint_states and armature at 490.196 Hz, takes duty_command.",
+    SETTINGS,
+    [
+        "plant",
+        "plant --ros-args -p preset:=thesis -p seed:=3",
+        "plant --ros-args --params-file model.yaml -p publish_truth:=true",
+        "plant --ros-args -p model.R_a:=1.2 -p effects.coulomb_friction.accel:=0.8",
+    ],
+    "  model.*, sensing.*, effects.ID.*: the numbers of a model file; what an effect is not given takes its"
+    " default\n  effects: " + ", ".join([*CATALOGUE, PARAMETER_MISMATCH]),
+    further={name: _setting(name) for name in NUMBERS},
+)
+
+
+class Pace:
+    """The absolute deadlines of a periodic thread, and how well it keeps them.
+
+    Args:
+        period_ns: between deadlines, ns of `clock`.
+        backlog: how many periods late a deadline may be met; older ones are given up.
+        clock: monotonic time, ns.
+        sleep: sleeps for seconds.
+    """
+
+    BIN_NS = 10_000
+    BINS = 1000
+
+    def __init__(
+        self,
+        period_ns: int,
+        backlog: int,
+        clock: Callable[[], int] = time.monotonic_ns,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._period = period_ns
+        self._backlog = backlog
+        self._clock = clock
+        self._sleep = sleep
+        self.deadline = clock()
+        self.late = 0
+        self.max_lateness_ns = 0
+        self._histogram = [0] * (self.BINS + 1)
+
+    def next(self) -> int:
+        """Sleep to the next deadline and return how many deadlines before it were given up."""
+        self.deadline += self._period
+        wait = self.deadline - self._clock()
+        while wait > 0:
+            self._sleep(wait * 1e-9)
+            wait = self.deadline - self._clock()
+        lateness = -wait
+        given_up = 0
+        if lateness >= self._period:
+            self.late += 1
+            given_up = max(0, lateness // self._period - self._backlog)
+            self.deadline += given_up * self._period
+        if lateness > self.max_lateness_ns:
+            self.max_lateness_ns = lateness
+        self._histogram[min(lateness // self.BIN_NS, self.BINS)] += 1
+        return given_up
+
+    def percentile_ms(self, share: float) -> float:
+        """Return the lateness that this share of all deadlines stayed below, ms, in steps of 0.01 up to 10."""
+        wanted = share * sum(self._histogram)
+        count = 0
+        for at, number in enumerate(self._histogram):
+            count += number
+            if count >= wanted:
+                return (at + 1) * self.BIN_NS * 1e-6
+        return math.inf
+
+
+class Plant(Node):
+    """The node. See the module's docstring for time, and contract section 1 for topics."""
+
+    def __init__(self) -> None:
+        super().__init__("plant", automatically_declare_parameters_from_overrides=True)
+        given = overrides(self)
+        settings, model = read_parameters(self, given)
+        # imported here: compiling can take seconds, and a signal must already be handled by then
+        from aeropend_sim.model.rig import Rig
+
+        self._rig = Rig(model, settings["seed"])
+        self._rig.run(np.zeros(1))  # compiles before the first deadline
+        self._rig.reset()
+        self._speed: float = settings["speed"]
+        self._lock = threading.Lock()  # of the rig and the duty
+        self._duty = 0.0
+        self._enabled = True
+        self._refused = 0
+        self._samples = 0
+        self._lost = 0
+        self._clock_steps = 0
+        self._pace: Pace | None = None
+        self._load = (time.monotonic(), time.process_time())
+
+        qos = interface.QOS
+        self._joint_states = self.create_publisher(JointState, interface.JOINT_STATES, qos)
+        self._armature = self.create_publisher(BatteryState, interface.ARMATURE, qos)
+        self._truth = settings["publish_truth"]
+        if self._truth:
+            self._truth_joint_states = self.create_publisher(JointState, interface.TRUTH_JOINT_STATES, qos)
+            self._truth_armature = self.create_publisher(BatteryState, interface.TRUTH_ARMATURE, qos)
+        if self._speed != 1.0:
+            self._clock_publisher = self.create_publisher(Clock, "/clock", qos)
+        self.create_subscription(Float64, interface.DUTY_COMMAND, self._on_duty, qos)
+        self.create_service(SetBool, interface.ENABLE, self._on_enable)
+        self.create_service(Trigger, interface.RESET, self._on_reset)
+        self._diagnostics = Diagnostics(self, self._report, "simulated aeropendulum")
+        effects = ", ".join(model.effects) or "none"
+        self.get_logger().info(f"model {settings['preset']}, effects: {effects}, speed {self._speed:g}")
+        self._worker = Worker(self, self._simulate if self._speed != 1.0 else self._real_time, "samples")
+        self._worker.start()
+
+    def close(self) -> None:
+        """Stop sampling."""
+        self._worker.stop()
+
+    def _real_time(self, end: threading.Event) -> None:
+        prepare_thread()
+        go_before_other_programs()
+        pace = self._pace = Pace(PERIOD_NS, BACKLOG)
+        to_ros = monotonic_to_ros_ns()
+        while not end.is_set():
+            given_up = pace.next()
+            if given_up:
+                self._lost += given_up
+                with self._lock:
+                    for done in range(0, given_up, 10_000):  # bounds the memory
+                        self._rig.run(np.full(min(given_up - done, 10_000), self._duty))
+                self.get_logger().warn(f"stood still: {given_up} samples lost, {self._lost} in all")
+            self._sample(pace.deadline + to_ros)
+            if self._samples % 490 == 0:
+                step = monotonic_to_ros_ns() - to_ros
+                if abs(step) > CLOCK_STEP_NS:
+                    periods = round(step / PERIOD_NS)
+                    to_ros += periods * PERIOD_NS
+                    self._clock_steps += 1
+                    self.get_logger().warn(f"the system clock was set: stamps move by {periods * SAMPLE_PERIOD:.3f} s")
+
+    def _simulate(self, end: threading.Event) -> None:
+        prepare_thread()
+        if self._speed > 0.0:
+            self._pace = Pace(round(PERIOD_NS / self._speed), BACKLOG)
+        stamp_ns = 0
+        while not end.is_set():
+            if self._pace is not None:
+                self._pace.next()
+            stamp_ns += PERIOD_NS
+            self._clock_publisher.publish(Clock(clock=interface.stamp(stamp_ns)))
+            self._sample(stamp_ns)
+
+    def _sample(self, stamp_ns: int) -> None:
+        with self._lock:
+            duty = self._duty
+            reading, state = self._rig.run(np.array([duty]))
+        theta, omega, i_a, v_a = reading[:, 0].tolist()
+        self._joint_states.publish(interface.joint_states_message(stamp_ns, theta, omega))
+        self._armature.publish(interface.armature_message(stamp_ns, v_a, i_a, duty))
+        if self._truth:
+            theta, theta_dot, i_a, omega, v_a, rotor_angle, _ = state[:, 0].tolist()
+            self._truth_joint_states.publish(
+                interface.joint_states_message(stamp_ns, theta, omega, theta_dot, rotor_angle)
+            )
+            self._truth_armature.publish(interface.armature_message(stamp_ns, v_a, i_a, duty))
+        self._samples += 1
+
+    def _on_duty(self, message: Float64) -> None:
+        if not math.isfinite(message.data):
+            self._refused += 1
+            if self._refused == 1:
+                self.get_logger().warn(f"duty_command {message.data} refused; further ones are only counted")
+            return
+        # as the 32-bit float that `armature` reports, so that a recording holds exactly what was applied
+        duty = ctypes.c_float(min(max(message.data, 0.0), 1.0)).value
+        with self._lock:
+            if self._enabled:
+                self._duty = duty
+
+    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        with self._lock:
+            self._enabled = request.data
+            if not self._enabled:
+                self._duty = 0.0  # and it stays 0 after enabling, until the next command
+        response.success = True
+        response.message = "enabled" if request.data else "disabled: duty 0"
+        return response
+
+    def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        with self._lock:
+            self._rig.reset()
+            self._duty = 0.0
+        response.success = True
+        response.message = "at rest, duty 0"
+        return response
+
+    def _report(self) -> tuple[str, dict[str, object]]:
+        wall, cpu = time.monotonic(), time.process_time()
+        load = (cpu - self._load[1]) / (wall - self._load[0]) if wall > self._load[0] else 0.0
+        self._load = (wall, cpu)
+        pace = self._pace
+        values: dict[str, object] = {
+            "samples": self._samples,
+            "late ticks": pace.late if pace else 0,
+            "lost ticks": self._lost,
+            "refused commands": self._refused,
+            "lateness max ms": pace.max_lateness_ns * 1e-6 if pace else 0.0,
+            "lateness p99 ms": pace.percentile_ms(0.99) if pace else 0.0,
+            "clock steps": self._clock_steps,
+            "cpu share": load,
+            "enabled": self._enabled,
+        }
+        return (f"{self._lost} samples lost" if self._lost else ""), values
+
+
+def read_parameters(node: Node, given: dict[str, Any]) -> tuple[dict[str, Any], Model]:
+    """Check and declare the node's parameters.
+
+    Args:
+        node: the plant's.
+        given: what was set, by full name.
+
+    Returns:
+        The settings, and the model.
+
+    Raises:
+        UserError: unknown name, wrong type, or out of range.
+    """
+    mine = {name: value for name, value in given.items() if name.split(".")[0] not in ("model", "sensing", "effects")}
+    settings = read_settings(node, SETTINGS, mine)
+    flat = {name: value for name, value in given.items() if name not in mine}
+    try:
+        model = from_flat(_with_defaults(flat), "parameters", load(settings["preset"]))
+    except ModelError as error:
+        raise UserError(str(error)) from error
+    for name, value in to_flat(model).items():
+        declare(node, name, value, _setting(name).descriptor())
+    return settings, model
+
+
+def _with_defaults(flat: dict[str, Any]) -> dict[str, Any]:
+    """Resolve what a parameter file leaves empty: `effects: {}`, and an effect without any of its parameters."""
+    resolved: dict[str, Any] = {}
+    for name, value in flat.items():
+        effect = CATALOGUE.get(name.removeprefix("effects."))
+        if value == "" and name.startswith("effects.") and effect is not None:
+            resolved |= {f"{name}.{key}": parameter.default for key, parameter in effect.parameters.items()}
+        elif value == "" and name in ("model", "sensing", "effects"):
+            continue
+        elif name == "effects":
+            raise UserError(f"parameter effects is {value!r}: give effects by id, as effects: {{gust: {{sigma: 1.5}}}}")
+        else:
+            resolved[name] = value
+    return resolved
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point of `plant`."""
+    return run(Plant, args, USAGE)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

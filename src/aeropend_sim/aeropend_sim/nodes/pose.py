@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rig's pose for robot_state_publisher, RViz and Foxglove.
+
+No sensor measures the rotor's angle, so `joint_states` says NaN there. robot_state_publisher makes a transform of NaN
+of it, which tf2 refuses with an error each time. This node publishes the same samples, fewer of them, with the rotor's
+angle integrated from its speed: where it began is not known, which nobody sees.
+"""
+
+import math
+import sys
+import time
+from collections.abc import Sequence
+
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState
+
+from aeropend_sim.ros import interface
+from aeropend_sim.ros.program import Diagnostics, Setting, overrides, read_settings, run, usage
+
+PAUSE_S = 0.5
+"""The rotor does not turn over a longer pause between samples, s."""
+
+SETTINGS = {
+    "rate": Setting(50.0, "poses a second at most", "Hz", 1.0, 500.0),
+    "slow": Setting(20.0, "the propeller is shown turning this many times slower, so that an eye can follow", low=1.0,
+                    high=1e3),
+}
+
+USAGE = usage(
+    "pose: publishes joint_states again on pose/joint_states, every joint with a position, to look at the rig in 3D.",
+    SETTINGS,
+    [
+        "pose",
+        "pose --ros-args -p slow:=1.0",
+        "pose --ros-args -r __ns:=/rig1",
+    ],
+    "  With a ROS 2 install, the rig moves in RViz and Foxglove when this runs besides:\n"
+    "  ros2 run robot_state_publisher robot_state_publisher $(ros2 pkg prefix --share aeropend_sim)/urdf/"
+    "aeropendulum.urdf \\\n    --ros-args -r joint_states:=pose/joint_states\n"
+    "  In RViz: fixed frame base, and a RobotModel of the topic robot_description.",
+)
+
+
+class Rotor:
+    """Where the propeller is, from how fast it turns.
+
+    Args:
+        slow: it turns this many times slower than measured.
+    """
+
+    def __init__(self, slow: float = 1.0) -> None:
+        self.angle = 0.0
+        self._slow = slow
+        self._last_ns: int | None = None
+
+    def turn(self, stamp_ns: int, omega: float) -> float:
+        """Return its angle at a sample, rad in -pi..pi.
+
+        Args:
+            stamp_ns: instant of the sample, ns.
+            omega: its speed, rad/s; NaN: not known, it stays.
+        """
+        passed = 0.0 if self._last_ns is None else 1e-9 * (stamp_ns - self._last_ns)
+        self._last_ns = stamp_ns
+        if 0.0 < passed < PAUSE_S and math.isfinite(omega):
+            self.angle = math.remainder(self.angle + passed * omega / self._slow, 2.0 * math.pi)
+        return self.angle
+
+
+class Pose(Node):
+    """The node."""
+
+    def __init__(self) -> None:
+        super().__init__("pose", automatically_declare_parameters_from_overrides=True)
+        settings = read_settings(self, SETTINGS, overrides(self))
+        self._pause_s = 1.0 / settings["rate"]
+        self._rotor = Rotor(settings["slow"])
+        self._due = 0.0
+        self._counts = {"samples": 0, "published": 0, "without angle": 0, "malformed": 0}
+        self._publisher = self.create_publisher(JointState, interface.POSE, interface.QOS)
+        self.create_subscription(JointState, interface.JOINT_STATES, self._on_joint_states, interface.QOS, raw=True)
+        self._diagnostics = Diagnostics(self, lambda: ("", self._counts))
+
+    def _on_joint_states(self, raw: bytes) -> None:
+        self._counts["samples"] += 1
+        now = time.monotonic()
+        if now < self._due:
+            return
+        try:
+            message = deserialize_message(raw, JointState)
+        except Exception:  # of the middleware's own types
+            self._counts["malformed"] += 1
+            return
+        arm, rotor = interface.JOINTS
+        theta = dict(zip(message.name, message.position)).get(arm, math.nan)
+        omega = dict(zip(message.name, message.velocity)).get(rotor, math.nan)
+        if not math.isfinite(theta):
+            self._counts["without angle"] += 1
+            return
+        self._due = now + self._pause_s
+        stamp_ns = interface.stamp_ns(message.header.stamp)
+        angle = self._rotor.turn(stamp_ns, omega)
+        self._publisher.publish(interface.joint_states_message(stamp_ns, theta, omega, rotor_angle=angle))
+        self._counts["published"] += 1
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point of `pose`."""
+    return run(Pose, args, USAGE)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
