@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from aeropend_ident.diagnosis import document, free_run_gap, joint_fit, regions
+from aeropend_ident.diagnosis import conclude, free_run_gap, joint_fit, regions
 from aeropend_ident.diagnosis.chain import nominal_fit
 from aeropend_ident.diagnosis.chain.cached_chain import ThriftyChains
 from aeropend_ident.diagnosis.chain.chain import PLACE_OF_NUMBER, Chains, of_recording, with_values
@@ -111,7 +111,7 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
     if strange is not None and unexplained:
         unexplained = {strange.shape.place: sum(unexplained.values())}
     amounts = _amounts(found, values, scorer, torque, spikes, before, unexplained)
-    candidates = document.candidates(findings, values, sd, torque, spikes, scorer, gap_after.total)
+    candidates = conclude.candidates(findings, values, sd, torque, spikes, scorer, gap_after.total)
     reasons = [f"{c} is off by {x:.1f} times a reading's noise"
                for c, x in _left(findings, torque is not None).items() if x > GOOD_ENOUGH]
     parts = regions.shares((place, amount) for _, place, amount in amounts)
@@ -121,11 +121,11 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
     if strange is not None and (strange.first or not effects):
         verdict, place = "unknown", strange.shape.place
 
-    least = document.UNDECIDED_UNKNOWN if chains.fit_nominal else document.UNDECIDED
-    undecided = document.not_separable(findings, least)
+    least = conclude.UNDECIDED_UNKNOWN if chains.fit_nominal else conclude.UNDECIDED
+    undecided = conclude.not_separable(findings, least)
     tried = within(max(float(s.duty.max()) for s in recordings)) if chains.fit_nominal else EXPERIMENTS
     augmented = _augmented(model, values, torque, spikes)
-    rows = document.numbers(chains, values, sd)
+    rows = conclude.numbers(chains, values, sd)
     names = [c for c in CHANNELS if c in gap_before.rms]
     body: dict[str, object] = {
         "channels": {c: {"unit": CHANNELS[c], "gap": gap_before.rms[c], "floor": floors[c],
@@ -137,13 +137,13 @@ def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
                                           "dependence": check.dependence}
                                 for check in settled.checks.values() for channel in check.rms},
                   "unexplained": reasons, "unknown": strange.document() if strange is not None else None,
-                  "not_separable": [list(document.names(a, b)) for a, b in undecided],
-                  "next_experiment": document.next_experiment(model, recordings[0], undecided, values, tried)},
+                  "not_separable": [list(conclude.names(a, b)) for a, b in undecided],
+                  "next_experiment": conclude.next_experiment(model, recordings[0], undecided, values, tried)},
         "shrink": {"gap": gap_before.total, "gap_after": gap_after.total, "floor": scorer.bottom(gap_before, floors),
                    "closed": share, "low": low, "high": high},
     }
     if chains.fit_nominal:
-        body["identified"] = document.identified_model(chains, values, sd, rows)
+        body["identified"] = conclude.identified_model(chains, values, sd, rows)
         model = with_values(model, nominal_fit.shared(base_values))
     progress("done", 1.0)
     return Diagnosis(model, augmented, recordings, before, after, body, {"misfit": misfit, **variables})
