@@ -23,7 +23,7 @@ from aeropend_sim.model.parameters import load, save
 from aeropend_sim.model.rig import Rig
 from aeropend_sim.nodes.plant import BACKLOG, PERIOD_NS, Pace, read_parameters
 from aeropend_sim.ros.interface import ARMATURE, DUTY_COMMAND, JOINT_STATES
-from aeropend_sim.ros.program import overrides
+from aeropend_sim.ros.settings import overrides
 
 
 class FakeTime:

@@ -54,9 +54,9 @@ class Hanging(Node):
     def destroy_node(self):
         time.sleep(1000.0)
 
-ros.LEAVE_S = 0.5
+program.LEAVE_S = 0.5
 threading.Timer(0.5, lambda: signal.raise_signal(signal.SIGINT)).start()
-sys.exit(ros.run(lambda: Hanging("hanging")))
+sys.exit(program.run(lambda: Hanging("hanging")))
 """
 
 

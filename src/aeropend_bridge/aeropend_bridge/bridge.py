@@ -31,9 +31,14 @@ from aeropend_bridge import calibration, protocol
 from aeropend_bridge.clock import BoardClock
 from aeropend_bridge.link import Link, LinkError
 from aeropend_bridge.protocol import Flag, Hello, Mode, Sample, Scheme
+from aeropend_sim.errors import UserError
 from aeropend_sim.ros import interface
-from aeropend_sim.ros.program import Diagnostics, Setting, UserError, Worker, overrides, read_settings, run, usage
+from aeropend_sim.ros.diagnostics import Diagnostics
+from aeropend_sim.ros.program import run
 from aeropend_sim.ros.realtime import CLOCK_STEP_NS, go_before_other_programs, monotonic_to_ros_ns, prepare_thread
+from aeropend_sim.ros.settings import Setting, overrides, read_settings
+from aeropend_sim.ros.usage import usage
+from aeropend_sim.ros.worker import Worker
 
 REPEAT_S = 0.02
 """Between repetitions of the present duty, s: the board may miss four."""

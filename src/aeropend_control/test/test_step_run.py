@@ -2,7 +2,7 @@
 import pytest
 
 from aeropend_control.nodes import reference, step_run
-from aeropend_sim.ros.program import UserError
+from aeropend_sim.errors import UserError
 
 
 def test_the_defaults_make_a_folder_of_their_own():

@@ -12,8 +12,9 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from aeropend_sim.errors import UserError
 from aeropend_sim.model.parameters import PARAMETERS, SECTIONS, Model, ModelError, load, save
-from aeropend_sim.ros.program import UserError, _readable_parameter_files
+from aeropend_sim.ros.parameter_files import readable_parameter_files
 from aeropend_sim.untrusted import LONGEST_MESSAGE, check_yaml, printable
 
 FUZZ = int(os.environ.get("FUZZ", "1"))
@@ -72,7 +73,7 @@ def read(data):
         assert said.isprintable()
         assert len(said) <= LONGEST_MESSAGE + 2
         with suppress(UserError):
-            _readable_parameter_files(["--params-file", str(path)], folder)
+            readable_parameter_files(["--params-file", str(path)], folder)
         assert {file.name for file in Path(folder).iterdir()} <= {"model.yaml", "0.yaml"}
 
 

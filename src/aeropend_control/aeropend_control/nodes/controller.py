@@ -29,11 +29,15 @@ from std_msgs.msg import Float64
 from aeropend_control.laws.registry import LAWS, GainError, Law, LawKind, TuningError
 from aeropend_control.nodes import wire
 from aeropend_control.nodes.supervisor import Supervisor
+from aeropend_sim.errors import UserError
 from aeropend_sim.model.parameters import PRESETS, ModelError, load
 from aeropend_sim.model.rig import Sample
 from aeropend_sim.ros import interface
-from aeropend_sim.ros.program import Diagnostics, Setting, Usage, UserError, overrides, read_settings, run, usage
+from aeropend_sim.ros.diagnostics import Diagnostics
+from aeropend_sim.ros.program import run
 from aeropend_sim.ros.realtime import go_before_other_programs
+from aeropend_sim.ros.settings import Setting, overrides, read_settings
+from aeropend_sim.ros.usage import Usage, usage
 
 WATCH_S = 0.01
 """How often the node looks whether samples still come, s."""

@@ -21,10 +21,15 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from std_msgs.msg import Float64
 
+from aeropend_sim.errors import UserError
 from aeropend_sim.model.excitation import KINDS, Excitation
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 from aeropend_sim.ros import interface
-from aeropend_sim.ros.program import Diagnostics, Setting, UserError, Worker, overrides, read_settings, run, usage
+from aeropend_sim.ros.diagnostics import Diagnostics
+from aeropend_sim.ros.program import run
+from aeropend_sim.ros.settings import Setting, overrides, read_settings
+from aeropend_sim.ros.usage import usage
+from aeropend_sim.ros.worker import Worker
 
 PERIOD_NS = round(SAMPLE_PERIOD * 1e9)
 REPEAT = 9

@@ -11,8 +11,11 @@ from collections.abc import Sequence
 from rclpy.node import Node
 from std_msgs.msg import Float64
 
+from aeropend_sim.errors import UserError
 from aeropend_sim.ros import interface
-from aeropend_sim.ros.program import UserError, Worker, run, usage, wait_until
+from aeropend_sim.ros.program import run
+from aeropend_sim.ros.usage import usage
+from aeropend_sim.ros.worker import Worker, wait_until
 
 REPEATS, REPEAT_S = 10, 0.02
 """How often the reference is sent, and s in between: confirmation by the middleware would take up to 3 s."""

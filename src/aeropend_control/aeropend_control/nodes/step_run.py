@@ -31,8 +31,11 @@ from aeropend_control.laws.registry import LAWS
 from aeropend_control.nodes import wire
 from aeropend_control.nodes.excite import ProgressShow
 from aeropend_sim.cli.command import Parser
+from aeropend_sim.errors import UserError
 from aeropend_sim.ros import interface
-from aeropend_sim.ros.program import EXIT_CODES, UserError, Worker, run, wait_until
+from aeropend_sim.ros.program import run
+from aeropend_sim.ros.usage import EXIT_CODES
+from aeropend_sim.ros.worker import Worker, wait_until
 
 LEVELS = {"theta": (0.2, 0.4, 0.7), "omega": (99.5,)}
 """What is stepped to, by what is measured; 99.5 rad/s are the thesis' 950 RPM."""

@@ -35,18 +35,13 @@ from rosbags.typesys import Stores, get_typestore
 from aeropend_ident.bags.bag import STORAGES
 from aeropend_ident.bags.msgtypes import learn, message_class
 from aeropend_ident.bags.writer import PLUGINS, BagWriter
+from aeropend_sim.errors import UserError
 from aeropend_sim.ros import interface
-from aeropend_sim.ros.program import (
-    Diagnostics,
-    Setting,
-    UserError,
-    Worker,
-    no_options,
-    overrides,
-    read_settings,
-    run,
-    usage,
-)
+from aeropend_sim.ros.diagnostics import Diagnostics
+from aeropend_sim.ros.program import run
+from aeropend_sim.ros.settings import Setting, overrides, read_settings
+from aeropend_sim.ros.usage import no_options, usage
+from aeropend_sim.ros.worker import Worker
 
 TAKE_S = 0.01
 CHECKPOINT_S = 0.5

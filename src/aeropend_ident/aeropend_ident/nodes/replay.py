@@ -27,18 +27,13 @@ from std_msgs.msg import Float64
 from aeropend_ident.bags.bag import Bag, RecordingError
 from aeropend_ident.bags.msgtypes import message_class
 from aeropend_ident.bags.recording import split_topic
+from aeropend_sim.errors import UserError
 from aeropend_sim.ros import interface
-from aeropend_sim.ros.program import (
-    Diagnostics,
-    Setting,
-    UserError,
-    Worker,
-    no_options,
-    overrides,
-    read_settings,
-    run,
-    usage,
-)
+from aeropend_sim.ros.diagnostics import Diagnostics
+from aeropend_sim.ros.program import run
+from aeropend_sim.ros.settings import Setting, overrides, read_settings
+from aeropend_sim.ros.usage import no_options, usage
+from aeropend_sim.ros.worker import Worker
 
 HORIZON_NS = 1_000_000_000
 """Messages may lie in a bag this much out of order, ns."""

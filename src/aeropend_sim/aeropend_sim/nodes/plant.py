@@ -30,6 +30,7 @@ from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool, Trigger
 
+from aeropend_sim.errors import UserError
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
 from aeropend_sim.model.parameters import (
     MODEL_NAMES,
@@ -43,18 +44,12 @@ from aeropend_sim.model.parameters import (
     to_flat,
 )
 from aeropend_sim.ros import interface
-from aeropend_sim.ros.program import (
-    Diagnostics,
-    Setting,
-    UserError,
-    Worker,
-    declare,
-    overrides,
-    read_settings,
-    run,
-    usage,
-)
+from aeropend_sim.ros.diagnostics import Diagnostics
+from aeropend_sim.ros.program import run
 from aeropend_sim.ros.realtime import CLOCK_STEP_NS, go_before_other_programs, monotonic_to_ros_ns, prepare_thread
+from aeropend_sim.ros.settings import Setting, declare, overrides, read_settings
+from aeropend_sim.ros.usage import usage
+from aeropend_sim.ros.worker import Worker
 
 PERIOD_NS = round(SAMPLE_PERIOD * 1e9)
 BACKLOG = 49

@@ -16,7 +16,10 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
 from aeropend_sim.ros import interface
-from aeropend_sim.ros.program import Diagnostics, Setting, overrides, read_settings, run, usage
+from aeropend_sim.ros.diagnostics import Diagnostics
+from aeropend_sim.ros.program import run
+from aeropend_sim.ros.settings import Setting, overrides, read_settings
+from aeropend_sim.ros.usage import usage
 
 PAUSE_S = 0.5
 """The rotor does not turn over a longer pause between samples, s."""
