@@ -8,12 +8,12 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
+from aeropend_sim.compiled import njit
 from aeropend_sim.model import actuator, dynamics, sensing
-from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.effects import CATALOGUE, Values
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 
 Array = NDArray[np.float64]
@@ -162,9 +162,9 @@ class Observer:
         return float(actuator.acting_voltage(self.numbers, held, self._effects, self.period, start, held[0])[1])
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _observe(theta: float, volts: Array, s: dynamics.State, m: sensing.Memory, gain: Array, chain: sensing.Chain,
-             c: dynamics.Coefficients, e: object, x: object
+             c: dynamics.Coefficients, e: Values | None, x: dynamics.Extra | None
              ) -> tuple[dynamics.State, sensing.Memory, tuple[dynamics.State, float, float, float]]:
     """Correct by a reading, advance over the first of the voltages, and predict over the others."""
     if not math.isnan(theta):
@@ -185,7 +185,7 @@ def _observe(theta: float, volts: Array, s: dynamics.State, m: sensing.Memory, g
     return s, m, (p, drive, nominal, dynamics.near_ground(p.theta, e))
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _correct_motor(omega: float, i_a: float, s: dynamics.State, known: Array, angles: Array, chain: sensing.Chain,
                    per_volt: float) -> dynamics.State:
     """The state after the readings of speed and current; `known` and `angles` (a ring of samples) are updated."""
@@ -227,7 +227,7 @@ def _correct_motor(omega: float, i_a: float, s: dynamics.State, known: Array, an
                           s.heat, s.flex, s.flex_dot, s.gust)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _at(angles: Array, k: float) -> float:
     """Angle of the rotor at a sample, also between two."""
     before = math.floor(k)

@@ -15,11 +15,11 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg.blas import dsyrk
 
 from aeropend_ident.identification.terms import Array, Indices, Library, Table, terms_at
+from aeropend_sim.compiled import njit
 
 Flags = NDArray[np.bool_]
 Weights = tuple[dict[str, float], dict[str, float]]
@@ -38,7 +38,7 @@ FAR = 1e3
 """Spreads of a state from its middle at which a run counts as run away."""
 
 
-@njit(inline="always", error_model="numpy")  # for the reason that the terms are
+@njit(cached=False, inline="always", error_model="numpy")  # for the reason that the terms are
 def _rates(x: Array, n: int, which: Indices, table: Table, equation: Indices, term: Indices, c: Array, value: Array,
            slope: Array, rate: Array, jacobian: Array) -> None:
     """Right-hand side and, where slope has rows, its Jacobian at variables x."""
@@ -56,7 +56,7 @@ def _rates(x: Array, n: int, which: Indices, table: Table, equation: Indices, te
                 jacobian[equation[k], i] += c[k] * slope[term[k], i]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", nogil=True)
 def _advance(y: Array, phi: Array, s: float, steps: int, which: Indices, table: Table, equation: Indices,
              term: Indices, c: Array, value: Array, slope: Array, x: Array, rate: Array, j: Array, total: Array,
              turn: Array, now: Array, moved: Array) -> None:
@@ -99,7 +99,7 @@ def _advance(y: Array, phi: Array, s: float, steps: int, which: Indices, table: 
                 phi[i, k] += turn[i, k]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", nogil=True)
 def _run(x0: Array, u: Array, h: float, steps: int, which: Indices, table: Table, equation: Indices, term: Indices,
          c: Array, low: Array, high: Array, out: Array) -> bool:
     """Run over the samples of u (N, inputs); fills out (N, states). False when a state leaves low..high."""
@@ -120,7 +120,7 @@ def _run(x0: Array, u: Array, h: float, steps: int, which: Indices, table: Table
     return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(error_model="numpy", nogil=True)
 def _sensitivities(states: Array, u: Array, h: float, steps: int, which: Indices, table: Table, equation: Indices,
                    term: Indices, c: Array, wanted: Indices, p_equation: Indices, p_term: Indices, outputs: Indices,
                    carry: Array, out: Array) -> None:

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from aeropend_sim.compiled import njit
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -149,7 +150,7 @@ def _apply(factor: Factor, x: Array) -> Array:
 
 
 # inlined: to count the references of so many arrays at each call takes longer than the terms
-@njit(inline="always", error_model="numpy")
+@njit(cached=False, inline="always", error_model="numpy")
 def factor_at(kind: int, power: float, x: float) -> float:
     """A factor."""
     if kind == SIN:
@@ -169,7 +170,7 @@ def factor_at(kind: int, power: float, x: float) -> float:
     return np.sign(x) * abs(x) ** power
 
 
-@njit(inline="always", error_model="numpy")
+@njit(cached=False, inline="always", error_model="numpy")
 def slope_at(kind: int, power: float, x: float) -> float:
     """The slope of a factor."""
     if kind == SIN:
@@ -189,7 +190,7 @@ def slope_at(kind: int, power: float, x: float) -> float:
     return power * abs(x) ** (power - 1.0) if abs(x) > 0.0 else 0.0
 
 
-@njit(inline="always", error_model="numpy")
+@njit(cached=False, inline="always", error_model="numpy")
 def terms_at(x: Array, which: Indices, table: Table, value: Array, slope: Array) -> None:
     """Fill value[j] and slope[j, :] of the terms `which` at variables x (V,); slope may have no rows: left out."""
     with_slope = slope.shape[0] > 0

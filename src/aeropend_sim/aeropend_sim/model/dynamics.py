@@ -18,16 +18,17 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from aeropend_sim.compiled import njit
 from aeropend_sim.model import actuator
 from aeropend_sim.model.effects import PARAMETER_MISMATCH, Values, is_active, values
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 
 Array = NDArray[np.float64]
 
-equation = njit(cache=True, forceinline=True, error_model="numpy")
+equation = njit(forceinline=True, error_model="numpy")
 """Compiles one equation into whatever calls it, without a test for zero before each division."""
 
 THRUST_PIVOT_SPEED = 150.0
@@ -243,7 +244,7 @@ def brush_sign(i: float) -> float:
 
 
 @equation
-def linearised_winding(i0: float, v: float, heat: float, c: Coefficients, e: Values, x: Extra
+def linearised_winding(i0: float, v: float, heat: float, c: Coefficients, e: Values, x: Extra | None
                        ) -> tuple[Lag, float, int]:
     """The winding with brushes and heat, v - v_brush tanh(i/0.02) - R(T) i - K_e ω, made linear around i0.
 
@@ -270,7 +271,7 @@ def linearised_winding(i0: float, v: float, heat: float, c: Coefficients, e: Val
 
 @equation
 def brush_winding(i0: float, v: float, w0: float, wm: float, w1: float, heat: float, pieces: int, c: Coefficients,
-                  e: Values, x: Extra) -> tuple[float, float]:
+                  e: Values, x: Extra | None) -> tuple[float, float]:
     """As `winding`, the hold cut in pieces, made linear in each (exponential Rosenbrock-Euler method)."""
     resistance = x.R_total + x.R_a * e.winding_heating_gain * heat
     pieces += pieces % 2
@@ -408,7 +409,7 @@ def mast_alone(q: float, qd: float, c: Coefficients, e: Values) -> tuple[float, 
 @equation
 def arm_with_dry_friction(y: float, yd: float, q: float, qd: float, f0: float, fm: float, f1: float, w0: float,
                           wm: float, w1: float, gust: float, c: Coefficients, e: Values,
-                          x: Extra) -> tuple[float, float, float, float]:
+                          x: Extra | None) -> tuple[float, float, float, float]:
     """As `arm`, with Coulomb friction.
 
     Where the motion reverses, the hold is cut at that instant, and the arm sticks there unless it is driven harder than
@@ -559,7 +560,7 @@ class Trajectory(NamedTuple):
     thrust: Array
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def run(v: Array, noise: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
     """Record the state at the start of each hold in out (7, N), advance over it; return the state after the last."""
     for k in range(v.shape[0]):
@@ -578,7 +579,7 @@ def run(v: Array, noise: Array, state: State, c: Coefficients, e: Values | None,
     return state
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def run_arm(speed: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
     """Air and arm alone, for a given speed (N,), linear between samples; fills out (2, N) with θ, θ̇."""
     for k in range(speed.shape[0]):
@@ -593,7 +594,7 @@ def run_arm(speed: Array, state: State, c: Coefficients, e: Values | None, x: Ex
     return state
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def run_motor(v: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
     """Winding and rotor alone, for the voltage at the terminals (N,), held; fills out (3, N) with i_a, ω, angle."""
     for k in range(v.shape[0]):
@@ -665,7 +666,7 @@ def _advance_lane(a: Array, j: int, x: State, v: float) -> None:
     a[(_STATE + 5) * n + j] = y.thrust
 
 
-@njit(cache=True, parallel=True)
+@njit(parallel=True)
 def _squared_errors(duty: Array, measured: Array, steps: int, table: Array) -> None:
     """One row of `table` is a block of models: row r of model j is at r LANES + j, so that lanes are SIMD lanes."""
     n = LANES

@@ -13,9 +13,9 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from aeropend_sim.compiled import njit
 from aeropend_sim.model.dynamics import NO_LAG, Lag, lag
 from aeropend_sim.model.effects import SPIKE_FACTOR
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
@@ -83,25 +83,25 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD) -> Chain:
                  effect("speed_spikes", "rate"))
 
 
-@njit(cache=True)
+@njit()
 def _encoder(theta: float, c: Chain) -> float:
     angle = theta + c.bias
     return angle + c.amplitude * math.sin(theta + c.phase) if c.amplitude != 0.0 else angle
 
 
-@njit(cache=True)
+@njit()
 def start(theta: float, theta_dot: float, omega: float, rotor_angle: float, c: Chain) -> Memory:
     """The chain at rest at an angle, as long ago settled."""
     angle = _encoder(theta, c)
     return Memory(angle, angle, theta, theta_dot, omega, rotor_angle, math.nan, math.nan, 0.0)
 
 
-@njit(cache=True)
+@njit()
 def _quantise(x: float, lsb: float) -> float:
     return lsb * math.floor(x / lsb + 0.5) if lsb > 0.0 else x
 
 
-@njit(cache=True)
+@njit()
 def filter_angle(m: Memory, theta: float, theta_dot: float, c: Chain) -> tuple[float, float]:
     """Both stages of the angle filter over one period, the angle between the samples by its Hermite cubic."""
     now = _encoder(theta, c)
@@ -116,7 +116,7 @@ def filter_angle(m: Memory, theta: float, theta_dot: float, c: Chain) -> tuple[f
     return stage1, stage2
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def angle_reading(theta: Array, theta_dot: Array, c: Chain) -> Array:
     """The angle (N,) that the encoder and its filter give for a motion (N,), before noise and quantisation."""
     out = np.empty(theta.shape[0])
@@ -129,7 +129,7 @@ def angle_reading(theta: Array, theta_dot: Array, c: Chain) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit()
 def time_pulses(m: Memory, omega: float, rotor_angle: float, uniform: Array, normal: float, c: Chain
                 ) -> tuple[float, float, float]:
     """Last pulse (s), held speed (rad/s) and this instant (s), after the pulses since the last sample."""
@@ -157,7 +157,7 @@ def time_pulses(m: Memory, omega: float, rotor_angle: float, uniform: Array, nor
     return last, speed, now
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def read(out: Array, truth: Array, normal: Array, uniform: Array, m: Memory, first: bool, c: Chain) -> Memory:
     """Read N states in sequence.
 

@@ -15,13 +15,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.chain import Chain, Chains, mean_speed, of_recording
 from aeropend_ident.diagnosis.search.gauss_markov import transition
 from aeropend_ident.estimation.map_fit import Fit, Search, Unknown, independent_samples
 from aeropend_ident.signals.signals import Signals
+from aeropend_sim.compiled import njit
 from aeropend_sim.model import sensing
 
 Array = NDArray[np.float64]
@@ -97,7 +97,7 @@ def hats(x: Array, count: int = KNOTS, train: int | None = None) -> tuple[Array,
     return np.column_stack([np.interp(filled, knots, row) for row in np.eye(len(knots))]), knots
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def arm_response(drive: Array, stiffness: Array, damping: float, tau: float, h: float) -> Array:
     """Change of the angle read (K, N) for torques over inertia (K, N), to first order.
 
@@ -119,7 +119,7 @@ def arm_response(drive: Array, stiffness: Array, damping: float, tau: float, h: 
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def motor_response(voltage: Array, torque: Array, omega: Array, R_a: float, L_a: float, K_e: float, K_t: float,
                    J_m: float, B_m: float, k_load: float, h: float) -> tuple[Array, Array, Array]:
     """Change of current, speed and rotor angle (K, N) for voltages (V) and torques (N·m) (K, N), to first order."""
@@ -144,7 +144,7 @@ def _slow(x: Array, tau: float, h: float) -> Array:
     return _lagged(np.ascontiguousarray(x), math.exp(-h / tau))
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _lagged(x: Array, keep: float) -> Array:
     out = np.empty_like(x)
     s = x[0]

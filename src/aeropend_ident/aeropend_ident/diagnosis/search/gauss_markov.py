@@ -11,8 +11,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from aeropend_sim.compiled import njit
 
 Array = NDArray[np.float64]
 
@@ -51,7 +52,7 @@ class Gust:
     heavy: float
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _filter(r: Array, stiffness: Array, damping: float, h: float, noise: float, sigma: float, tau: float,
             innovations: Array, kept: Array) -> float:
     """Kalman filter over (δ, δ̇, w); returns the log likelihood.
@@ -92,7 +93,7 @@ def _filter(r: Array, stiffness: Array, damping: float, h: float, noise: float, 
     return total
 
 
-@njit(cache=True)
+@njit()
 def transition(stiffness: float, damping: float, h: float) -> tuple[float, float, float, float, float, float]:
     """First two rows of the transition of (δ, δ̇, w) over h, to second order."""
     half = 0.5 * h * h
@@ -101,7 +102,7 @@ def transition(stiffness: float, damping: float, h: float) -> tuple[float, float
             h - half * damping)
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _smooth(kept: Array, stiffness: Array, damping: float, h: float, tau: float, torque: Array) -> None:
     """Rauch-Tung-Striebel smoother; fills the torque (M,)."""
     n = kept.shape[0]
@@ -116,7 +117,7 @@ def _smooth(kept: Array, stiffness: Array, damping: float, h: float, tau: float,
         torque[k] = x[2]
 
 
-@njit(cache=True)
+@njit()
 def symmetric(p: Array) -> Array:
     """The matrix (3, 3) of an upper triangle (6,)."""
     out = np.empty((3, 3))
@@ -176,7 +177,7 @@ def gauss_markov(shape: tuple[int, int], tau: float, period: float, rng: np.rand
     return _correlated(rng.standard_normal(shape), math.exp(-period / tau))
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True)
 def _correlated(white: Array, keep: float) -> Array:
     kick = math.sqrt(1.0 - keep * keep)
     for row in white:
