@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from aeropend_sim.model import actuator
+from aeropend_sim.model import actuator, dynamics
 from aeropend_sim.model.parameters import PRESETS, SAMPLE_PERIOD, load
 
 BENCH, THESIS = (load(preset).model for preset in ("bench", "thesis"))
@@ -177,3 +177,12 @@ def test_effects_of_no_size_change_no_bit(neutral):
     assert np.array_equal(acting(neutral), acting({}))
     rest = {id_: p for id_, p in others.items() if id_ not in neutral}
     assert np.array_equal(acting({**rest, **neutral}), acting(rest))
+
+
+def test_the_supply_sags_by_its_resistance_times_the_current():
+    model = load("bench").with_effects({"supply_sag": {"r_supply": 0.5}})
+    duty = np.repeat([0.2, 0.8, 0.4], 100)
+    run = dynamics.simulate(model, duty)
+    open_circuit = actuator.sampled_voltage(model.numbers(), duty, model.effects, SAMPLE_PERIOD)
+    assert np.array_equal(actuator.terminal_voltage(model, open_circuit, run.i_a), run.v_a)
+    assert actuator.terminal_voltage(load("bench"), 5.0, 2.0) == 5.0

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
 from aeropend_sim.model import actuator, dynamics
 from aeropend_sim.model.dynamics import simulate, squared_errors, steady, steps_in
@@ -411,3 +412,12 @@ def test_squared_errors_refuse_effects(id_):
 def test_squared_errors_take_effects_of_no_size():
     model = load("bench").with_effects({"coulomb_friction": {"accel": 0.0}})
     assert not squared_errors([model], np.zeros(3), np.zeros((4, 3))).any()
+
+
+@pytest.mark.parametrize("h", [2e-3, 1e-2])
+def test_the_transition_of_the_linear_arm_is_exact_to_second_order(h):
+    stiffness, damping = 40.0, 2.0
+    rates = np.array([[0.0, 1.0, 0.0], [-stiffness, -damping, 1.0], [0.0, 0.0, 0.0]])
+    exact = expm(rates * h)[:2]
+    missing = (np.linalg.norm(rates, 2) * h)**3 / 6.0
+    assert np.reshape(dynamics.linear_arm(stiffness, damping, h), (2, 3)) == pytest.approx(exact, abs=missing)

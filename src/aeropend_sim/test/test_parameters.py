@@ -255,3 +255,10 @@ def test_rcl_reads_a_preset_and_a_file_without_effects(tmp_path):
     assert read_with_rcl(path) == to_flat(load("bench"))
     save(load("bench"), path)
     assert read_with_rcl(path) == to_flat(load("bench"))
+
+
+def test_a_parameter_of_an_effect_is_neutral_in_a_model_without_the_effect():
+    model = load("bench").with_effects({"thrust_exponent": {"n": 1.8}})
+    assert model.effect("thrust_exponent", "n") == 1.8
+    assert load("bench").effect("thrust_exponent", "n") == 2.0
+    assert model.effect("command_delay", "delay") == 0.0

@@ -280,3 +280,15 @@ def test_bench_chain_as_stated():
     assert np.abs(found["v_a"] - truth["v_a"]).max() <= 0.5 * base.sensing["voltage_lsb"] + 1e-12
     lag = truth["theta"] - 2.0 * base.sensing["angle_filter_tau"] * truth["theta_dot"]
     assert np.abs(found["theta"] - lag).max() <= 0.5 * base.sensing["angle_lsb"] + 1e-3
+
+
+def test_the_reading_of_a_current_and_a_voltage_is_that_of_the_whole_chain():
+    effects = {"current_gain": {"gain": 0.3}, "current_offset": {"bias": 0.06}, "voltage_offset": {"bias": -0.1}}
+    base = load("thesis")
+    model = Model("read", base.model, dict.fromkeys(base.sensing, 0.0), effects)
+    i_a, v_a = np.linspace(-1.0, 2.0, 7), np.linspace(0.0, 9.0, 7)
+    out = read(states(7, i_a=i_a, v_a=v_a), sensing.prepare(model))
+    assert np.array_equal(sensing.read_current(model, i_a), out[I_A])
+    assert np.array_equal(sensing.read_voltage(model, v_a), out[V_A])
+    assert sensing.true_voltage(model, sensing.read_voltage(model, v_a)) == pytest.approx(v_a)
+    assert sensing.read_current(base, 1.5) == 1.5

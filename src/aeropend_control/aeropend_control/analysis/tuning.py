@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from aeropend_control.laws.observer import parameter
 from aeropend_sim.model import actuator
 from aeropend_sim.model.parameters import Model
 
@@ -133,4 +132,4 @@ def thrust_lag(model: Model, at: float) -> float:
     speed = float(actuator.speed(n, n["mgd_over_J"] / n["L_over_J"] * math.sin(at)))
     friction = n["B_m"] + 2.0 * n["k_load"] * speed
     motor = (n["R_a"] * n["J_m"] + n["L_a"] * friction) / (n["R_a"] * friction + n["K_e"] * n["K_t"])
-    return motor + parameter(model, "thrust_lag", "tau")
+    return motor + model.effect("thrust_lag", "tau")

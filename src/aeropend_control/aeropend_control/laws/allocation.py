@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_control.laws.observer import Observer, parameter
+from aeropend_control.laws.observer import Observer
 from aeropend_sim.model import actuator, dynamics
 
 Array = NDArray[np.float64]
@@ -29,14 +29,14 @@ class Allocation:
         model = observer.model
         self._observer, self._numbers = observer, model.numbers()
         self.thrust_time = thrust_time
-        self._bridge_drop = parameter(model, "bridge_drop", "v_drop")
-        self._supply_drift = parameter(model, "supply_drift", "rate")
-        self._supply_resistance = parameter(model, "supply_sag", "r_supply")
-        self._heating = parameter(model, "winding_heating", "gain")
-        self._brush_drop = parameter(model, "brush_drop", "v_brush")
-        self._rotor_friction = parameter(model, "rotor_friction", "torque")
-        self._thrust_lag = parameter(model, "thrust_lag", "tau")
-        self._thrust_exponent = parameter(model, "thrust_exponent", "n")
+        self._bridge_drop = model.effect("bridge_drop", "v_drop")
+        self._supply_drift = model.effect("supply_drift", "rate")
+        self._supply_resistance = model.effect("supply_sag", "r_supply")
+        self._heating = model.effect("winding_heating", "gain")
+        self._brush_drop = model.effect("brush_drop", "v_brush")
+        self._rotor_friction = model.effect("rotor_friction", "torque")
+        self._thrust_lag = model.effect("thrust_lag", "tau")
+        self._thrust_exponent = model.effect("thrust_exponent", "n")
 
     def duty(self, thrust: float, s: dynamics.State) -> tuple[float, float]:
         """Duty for a thrust (N) in a state, and the thrust that comes of it within the limits of the duty."""

@@ -19,7 +19,7 @@ from aeropend_control.laws import feedback_linearization
 from aeropend_control.laws.allocation import Allocation
 from aeropend_control.laws.feedback_linearization import FeedbackLinearization
 from aeropend_control.laws.gains import Gain, checked
-from aeropend_control.laws.observer import Estimate, Observer, parameter
+from aeropend_control.laws.observer import Estimate, Observer
 from aeropend_control.laws.pid import PID
 from aeropend_control.laws.reference_model import DAMPING, ReferenceModel
 from aeropend_sim.model import dynamics
@@ -180,7 +180,7 @@ class FeedbackLinearizationCascade(FeedbackLinearization):
         Raises:
             TuningError: one line that says which requirement cannot be met.
         """
-        air = parameter(model, "thrust_lag", "tau")
+        air = model.effect("thrust_lag", "tau")
         slower = min(requirements.t_r / 0.5, requirements.t_p / 0.9, requirements.t_s / 1.2)
         decay = STIFFNESS / slower * DAMPING
         M_p = math.exp(-math.pi * DAMPING / math.sqrt(1.0 - DAMPING**2))

@@ -13,7 +13,7 @@ from scipy.linalg import expm, solve_discrete_are
 
 from aeropend_sim.compiled import njit
 from aeropend_sim.model import actuator, dynamics, sensing
-from aeropend_sim.model.effects import CATALOGUE, Values
+from aeropend_sim.model.effects import Values
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 
 Array = NDArray[np.float64]
@@ -69,11 +69,6 @@ HISTORY = 512
 """Samples for which the angle of the rotor is kept: longer than the longest time between pulses that is read."""
 
 
-def parameter(model: Model, effect: str, name: str) -> float:
-    """A number of an effect; neutral where the model does not name the effect."""
-    return model.effects.get(effect, {}).get(name, CATALOGUE[effect].parameters[name].neutral)
-
-
 class Observer:
     """The model, run beside the rig and corrected by each reading of the angle, and if asked of the motor.
 
@@ -98,7 +93,7 @@ class Observer:
         self._gain = _kalman(self._chain, self.numbers["c_over_J"], period)
         n = self.numbers
         self._per_volt = n["K_t"] / (n["R_a"] * n["B_m"] + n["K_e"] * n["K_t"])  # rad/s, without load
-        delay = parameter(model, "command_delay", "delay") / period
+        delay = model.effect("command_delay", "delay") / period
         self._whole = math.floor(delay + 1e-9)
         self._effects = dict(model.effects)
         if delay > 0.0:  # whole periods of it are the queue's

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 from aeropend_control.laws.allocation import Allocation
 from aeropend_control.laws.gains import Gain, checked
-from aeropend_control.laws.observer import Estimate, Observer, parameter
+from aeropend_control.laws.observer import Estimate, Observer
 from aeropend_control.laws.pid import PID
 from aeropend_sim.model import dynamics
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
@@ -51,7 +51,7 @@ class PositionLaw:
         self._observer = Observer(model, period, self.reads_motor)
         self._pid = PID(0.0, period=period, exact=True)
         self._allocation = Allocation(self._observer)
-        self._arm_friction = parameter(model, "coulomb_friction", "accel")
+        self._arm_friction = model.effect("coulomb_friction", "accel")
         self._apply()
         self.reset()
 

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from aeropend_sim.model.parameters import Model
 
 Array = NDArray[np.float64]
 Numbers = Mapping[str, float]
@@ -122,6 +125,23 @@ def _over_hold(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str,
     late = voltage(numbers, np.concatenate([np.full(max(whole + 1, 0), before), duty, duty[n - max(-whole, 0):]]))
     then = at_bridge(late[1:n + 1])
     return (at_bridge(late[:n]) if part > 0.0 else then), then, part
+
+
+ScalarOrArray = TypeVar("ScalarOrArray", float, Array)
+
+
+def terminal_voltage(model: Model, voltage: ScalarOrArray, current: ScalarOrArray) -> ScalarOrArray:
+    """Voltage at the motor's terminals.
+
+    Args:
+        model: its effect `supply_sag` acts.
+        voltage: [V] scalar or (N,) voltage at the bridge without load, from `acting_voltage` or `sampled_voltage`.
+        current: [A] armature current, in the same shape.
+
+    Returns:
+        [V] v - r_supply i, in the same shape.
+    """
+    return voltage - model.effect("supply_sag", "r_supply") * current
 
 
 def static_angle(numbers: Numbers, duty: ArrayLike) -> Array:

@@ -560,6 +560,26 @@ class Trajectory(NamedTuple):
     thrust: Array
 
 
+@njit()
+def linear_arm(stiffness: float, damping: float, h: float) -> tuple[float, float, float, float, float, float]:
+    """Transition of the arm, made linear around a motion, over a short time, to second order in the time.
+
+    The state is (δ, δ̇, w): deviation of the angle and of its rate, and a torque over inertia that stays constant.
+
+    Args:
+        stiffness: [1/s²] slope of the restoring torque over inertia: mgd/J cos θ for gravity.
+        damping: [1/s] viscous friction over inertia.
+        h: [s] time.
+
+    Returns:
+        The first two rows of the transition matrix: δ from (δ, δ̇, w), then δ̇ from (δ, δ̇, w).
+    """
+    half = 0.5 * h * h
+    return (1.0 - half * stiffness, h - half * damping, half,
+            -h * stiffness + half * damping * stiffness, 1.0 - h * damping + half * (damping * damping - stiffness),
+            h - half * damping)
+
+
 @njit(nogil=True)
 def run(v: Array, noise: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
     """Record the state at the start of each hold in out (7, N), advance over it; return the state after the last."""

@@ -93,6 +93,15 @@ class Model:
         """The plant's numbers with `parameter_mismatch` applied."""
         return {**self.model, **self.effects.get(PARAMETER_MISMATCH, {})}
 
+    def effect(self, id_: str, parameter: str) -> float:
+        """A parameter of an effect; its neutral value if the model does not have the effect.
+
+        Args:
+            id_: the effect's id in the catalogue.
+            parameter: name of its parameter.
+        """
+        return float(self.effects.get(id_, {}).get(parameter, CATALOGUE[id_].parameters[parameter].neutral))
+
     def with_effects(self, effects: Mapping[str, Mapping[str, float]]) -> Model:
         """The same model with these effects in place of its own."""
         return Model(self.name, self.model, self.sensing, effects)

@@ -42,7 +42,7 @@ class Rig:
         self._numbers = model.numbers()
         self._plant = dynamics.prepare(model, period)
         self._chain = sensing.prepare(model, period)
-        delay = model.effects.get("command_delay", {}).get("delay", 0.0)
+        delay = model.effect("command_delay", "delay")
         self._history = math.ceil(delay / period) + 1
         self.reset()
 

@@ -9,8 +9,7 @@ pulses (`speed_spikes` falsify it).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,15 +63,57 @@ class Memory(NamedTuple):
     time: float
 
 
+ScalarOrArray = TypeVar("ScalarOrArray", float, Array)
+
+
+def read_current(model: Model, current: ScalarOrArray) -> ScalarOrArray:
+    """Reading of a current before noise and quantisation.
+
+    Args:
+        model: its effects `current_gain` and `current_offset` act.
+        current: [A] scalar or (N,) true current.
+
+    Returns:
+        [A] i (1 + gain) + bias, in the shape of `current`.
+    """
+    return current * (1.0 + model.effect("current_gain", "gain")) + model.effect("current_offset", "bias")
+
+
+def read_voltage(model: Model, voltage: ScalarOrArray) -> ScalarOrArray:
+    """Reading of a voltage before noise and quantisation.
+
+    Args:
+        model: its effect `voltage_offset` acts.
+        voltage: [V] scalar or (N,) true voltage at the motor's terminals.
+
+    Returns:
+        [V] v + bias, in the shape of `voltage`.
+    """
+    return voltage + model.effect("voltage_offset", "bias")
+
+
+def true_voltage(model: Model, reading: ScalarOrArray) -> ScalarOrArray:
+    """The inverse of `read_voltage`.
+
+    Args:
+        model: its effect `voltage_offset` acts.
+        reading: [V] scalar or (N,) voltage read.
+
+    Returns:
+        [V] v - bias, in the shape of `reading`.
+    """
+    return reading - model.effect("voltage_offset", "bias")
+
+
+def angle_filter_tau(model: Model) -> float:
+    """[s] Time constant of each of the two stages of the angle filter, with the effect `encoder_lag`."""
+    return model.sensing["angle_filter_tau"] + model.effect("encoder_lag", "tau")
+
+
 def prepare(model: Model, period: float = SAMPLE_PERIOD) -> Chain:
     """What `read` needs of a model for samples `period` seconds apart."""
-    s, e = model.sensing, model.effects
-
-    def effect(id_: str, name: str) -> float:
-        parameters: Mapping[str, float] = e.get(id_, {})
-        return float(parameters.get(name, 0.0))
-
-    tau = s["angle_filter_tau"] + effect("encoder_lag", "tau")
+    s, effect = model.sensing, model.effect
+    tau = angle_filter_tau(model)
     rate = 1.0 / tau if tau > NO_LAG * period else 0.0
     return Chain(period, lag(rate, period), rate, effect("angle_offset", "bias"),
                  effect("encoder_eccentricity", "amplitude"), effect("encoder_eccentricity", "phase"),
