@@ -28,9 +28,9 @@ from joblib import Parallel, delayed
 
 from aeropend_ident.bags import recording
 from aeropend_ident.bags.recording import RecordingError
+from aeropend_ident.commands import identify
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.results import document
-from aeropend_ident.identification import identify
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import from_recording
 from aeropend_ident.testing import bags

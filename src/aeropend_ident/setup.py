@@ -31,7 +31,7 @@ setup(
             "replay = aeropend_ident.nodes.replay:main",
             "recover = aeropend_ident.commands.recover:main",
             "diagnose = aeropend_ident.commands.diagnose:main",
-            "identify = aeropend_ident.identification.identify:main",
+            "identify = aeropend_ident.commands.identify:main",
             "bench_test = aeropend_ident.commands.bench:main",
             "excitation_quality = aeropend_ident.commands.excitation_quality:main",
             "step_response = aeropend_ident.commands.step_response:main",

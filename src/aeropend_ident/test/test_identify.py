@@ -15,7 +15,7 @@ from aeropend_sim.model.parameters import Model
 KEYS = ["format", "method", "terms", "equations", "sigma", "held_out_mse", "seconds"]
 
 
-COMMAND = Command("aeropend_ident.identification.identify")
+COMMAND = Command("aeropend_ident.commands.identify")
 run, refused = COMMAND.run, COMMAND.refused
 
 

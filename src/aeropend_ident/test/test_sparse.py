@@ -6,11 +6,13 @@ import pytest
 from scipy.signal import lfilter
 
 from aeropend_ident.bags.recording import RecordingError
+from aeropend_ident.commands.identify import document, lines
 from aeropend_ident.identification.dataset import from_arrays
 from aeropend_ident.identification.discrepancy import nominal
-from aeropend_ident.identification.identify import Problem, document, identify, lines
+from aeropend_ident.identification.identify import identify
 from aeropend_ident.identification.output_error import Entries, Fitter
 from aeropend_ident.identification.output_error_selection import Linear
+from aeropend_ident.identification.problem import Problem
 from aeropend_ident.identification.subset_selection import Sums, select
 from aeropend_ident.identification.terms import thesis_terms
 from aeropend_ident.studies import lorenz
@@ -132,22 +134,24 @@ TERMS = ["x", "u", "w", "x*u", "x*x"]
 
 
 def test_a_term_that_hangs_on_one_stretch_of_the_recording_is_undetermined():
-    found = identify(pushed_once(0.5), "weak", TERMS)
+    data = pushed_once(0.5)
+    found = identify(data, "weak", TERMS)
     assert found.stability["x"]["u"] == 1.0
     assert 0.4 < found.stability["x"]["w"] < 0.8
     assert any("w [undetermined: in " in line for line in lines(found))
-    (listed,) = document(found, "bag", "bench", 0.0)["undetermined"]
+    (listed,) = document(found, data, "bag", "bench", 0.0)["undetermined"]
     assert (listed["equation"], listed["term"]) == ("x", "w")
 
 
 def test_such_a_term_is_left_out_where_held_out_data_do_not_miss_it():
-    found = identify(pushed_once(0.02), "weak", TERMS)
+    data = pushed_once(0.02)
+    found = identify(data, "weak", TERMS)
     assert set(found.equations["x"]) == set(found.stability["x"]) == {"x", "u"}
     ((state, term, often),) = found.unstable
     assert (state, term) == ("x", "w")
     assert often < 0.8
     assert any("w is left out" in line for line in lines(found))
-    (listed,) = document(found, "bag", "bench", 0.0)["undetermined"]
+    (listed,) = document(found, data, "bag", "bench", 0.0)["undetermined"]
     assert (listed["term"], listed["left_out"]) == ("w", True)
 
 
@@ -158,8 +162,8 @@ def test_a_choice_that_the_free_run_does_not_keep_is_taken_back(monkeypatch):
 
 def test_the_normal_equations_of_stretches_add_up_to_those_of_the_whole():
     x, v = simulated(8.0)
-    problem = Problem(from_arrays(noisy(x, 50.0, 0), {"v_a": v}, SAMPLE_PERIOD), thesis_terms((*STATES, "v_a")), None)
-    start = problem.fill(np.array([[TRUE[s].get(t, 0.0) for t in problem.names] for s in STATES]))
+    problem = Problem(from_arrays(noisy(x, 50.0, 0), {"v_a": v}, SAMPLE_PERIOD), thesis_terms((*STATES, "v_a")))
+    start = problem.widened(np.array([[TRUE[s].get(t, 0.0) for t in problem.names] for s in STATES]))
     for length in (0, 900):  # one run, and shots
         fitter = Fitter(problem.experiment(2900), Entries.of(start), length)
         states = fitter.run(*fitter.point)
@@ -179,10 +183,11 @@ def test_a_term_that_the_data_cannot_tell_from_another_is_said_to_be_undetermine
     for k in range(len(t) - 1):  # so small an angle that its sine is itself
         x[k + 1] = x[k] * np.exp(-2.0 * 0.005) + 1e-3 * u[k] * (1.0 - np.exp(-2.0 * 0.005)) / 2.0
     x += 1e-5 * np.random.default_rng(6).standard_normal(len(t))
-    found = identify(from_arrays({"x": x}, {"u": u}, 0.005), "weak")
+    data = from_arrays({"x": x}, {"u": u}, 0.005)
+    found = identify(data, "weak")
     pairs = {frozenset((a.term, a.instead)) for a in found.alternatives}
     assert frozenset(("x", "sin(x)")) in pairs
-    listed = document(found, "bag", "bench", 0.0)["undetermined"]
+    listed = document(found, data, "bag", "bench", 0.0)["undetermined"]
     assert frozenset(("x", "sin(x)")) in {frozenset((one["term"], one.get("or"))) for one in listed}
 
 

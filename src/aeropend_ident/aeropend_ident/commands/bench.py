@@ -21,8 +21,8 @@ from aeropend_ident.bags import recording
 from aeropend_ident.bags.recording import Recording, RecordingError
 from aeropend_ident.bench_tests import estimates
 from aeropend_ident.bench_tests.estimates import BenchTestError, Estimate, Found, Rows
+from aeropend_ident.bench_tests.picture import scatter
 from aeropend_ident.bench_tests.table import read_rows
-from aeropend_ident.identification.picture import scatter
 from aeropend_ident.result_folder import OutputError, check, whole
 from aeropend_sim.cli.command import Parser, interruptible
 from aeropend_sim.model.parameters import PRESETS, Model, ModelError, from_flat, load, save

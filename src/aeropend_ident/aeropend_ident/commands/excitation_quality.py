@@ -22,9 +22,9 @@ from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.identification import dataset
 from aeropend_ident.identification.dataset import Dataset
 from aeropend_ident.identification.discrepancy import in_library
-from aeropend_ident.identification.identify import Problem
 from aeropend_ident.identification.output_error import Entries, Fitter
 from aeropend_ident.identification.output_error_selection import alternatives, linearise
+from aeropend_ident.identification.problem import Problem
 from aeropend_ident.identification.terms import Array, thesis_terms
 from aeropend_sim.cli.command import EXIT_CODES, Parser, interruptible
 from aeropend_sim.cli.progress import Show, nothing, progress
@@ -89,12 +89,12 @@ def quality(model: Model, data: Dataset, show: Show = nothing) -> list[Excited]:
     """
     true = in_library(model)
     names = thesis_terms(data.variables)
-    problem = Problem(data, names, None)
+    problem = Problem(data, names)
     matrix = np.zeros((len(data.states), len(names)))
     for k, s in enumerate(data.states):
         if k not in problem.exact:
             matrix[k] = [true[s].get(t, 0.0) for t in names]
-    start = problem.fill(matrix)
+    start = problem.widened(matrix)
     fitter = Fitter(problem.experiment(len(data)), Entries.of(start), 0, floor=1.0)
     equation, term = np.nonzero(problem.candidates)
     every = Entries(equation.astype(np.int64), term.astype(np.int64), np.zeros(len(term)))
