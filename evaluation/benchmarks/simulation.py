@@ -18,7 +18,7 @@ from numba import config, set_num_threads
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from aeropend_sim.model import actuator, dynamics
+from aeropend_sim.model import actuator, dynamics, ensemble
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
@@ -182,7 +182,7 @@ def batch(quick: bool) -> list[Figure]:
         return errors
 
     def ours() -> Array:
-        return dynamics.squared_errors(models, series, measured)
+        return ensemble.squared_errors(models, series, measured)
 
     set_num_threads(min(THREADS, config.NUMBA_NUM_THREADS))
     if not np.allclose(ours()[:, (0, 1, 3)], c()[:, (0, 1, 3)], rtol=1e-2):
@@ -196,7 +196,7 @@ def batch(quick: bool) -> list[Figure]:
 COMPILE = """
 import time, numpy as np
 start = time.process_time()
-from aeropend_sim.model import dynamics, rig
+from aeropend_sim.model import dynamics, ensemble, rig
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import load
 imported = time.process_time()
@@ -208,7 +208,7 @@ for one in (model, full):
     c, e, x = dynamics.prepare(one)
     dynamics.run_arm(duty, dynamics.State(), c, e, x, np.empty((2, 10)))
     dynamics.run_motor(duty, dynamics.State(), c, e, x, np.empty((3, 10)))
-dynamics.squared_errors([model], duty, np.zeros((4, 10)))
+ensemble.squared_errors([model], duty, np.zeros((4, 10)))
 print(imported - start, time.process_time() - imported)
 """
 

@@ -174,9 +174,9 @@ def _observe(theta: float, volts: Array, s: dynamics.State, m: sensing.Memory, g
     stage1, stage2 = sensing.filter_angle(m, s.theta, s.theta_dot, chain)
     m = sensing.Memory(stage1, stage2, s.theta, s.theta_dot, m.omega, m.rotor_angle, m.last_pulse, m.speed, m.time)
     p = dynamics.run(volts[1:], silent, s, c, e, x, scratch) if len(volts) > 1 else s
-    sine = math.sin(p.theta)
-    drive = dynamics.arm_drive(sine, p.theta, p.theta_dot, 0.0, p.omega, 0.0, 0.0, 0.0, c, e)
-    nominal = dynamics.arm_drive(sine, p.theta, p.theta_dot, 0.0, p.omega, 0.0, 0.0, 0.0, c, None)
+    sine, motion = math.sin(p.theta), dynamics.Motion(p.theta, p.theta_dot, 0.0, 0.0)
+    drive = dynamics.arm_drive(sine, motion, 0.0, p.omega, 0.0, c, e)
+    nominal = dynamics.arm_drive(sine, motion, 0.0, p.omega, 0.0, c, None)
     return s, m, (p, drive, nominal, dynamics.near_ground(p.theta, e))
 
 

@@ -14,16 +14,14 @@ Source of the nominal equations: thesis (3.2) to (3.5), with the quadratic load 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
 from aeropend_sim.compiled import njit
 from aeropend_sim.model import actuator
-from aeropend_sim.model.effects import PARAMETER_MISMATCH, Values, is_active, values
+from aeropend_sim.model.effects import Values, values
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 
 Array = NDArray[np.float64]
@@ -141,6 +139,23 @@ class State(NamedTuple):
     gust: float = 0.0
 
 
+class Over(NamedTuple):
+    """A quantity over one step."""
+
+    start: float
+    middle: float
+    end: float
+
+
+class Motion(NamedTuple):
+    """The motion of the arm, and of the mode of the mast."""
+
+    theta: float
+    theta_dot: float
+    flex: float
+    flex_dot: float
+
+
 @equation
 def sine_cosine(x: float) -> tuple[float, float]:
     """(sin x, cos x) to 1e-15 within some turns, without a branch or a call: many models then advance in SIMD lanes."""
@@ -168,32 +183,63 @@ def near(sin_x: float, cos_x: float, d: float) -> float:
 
 
 @equation
-def winding(i0: float, v: float, w0: float, wm: float, w1: float, k: Lag, c: Coefficients) -> tuple[float, float]:
-    """L_a di/dt = v - R_a i - K_e ω, thesis (3.5): current at h/2 and h, for the speed at 0, h/2, h."""
-    g0, gm, g1 = (v - c.K_e * w0) * c.per_L, (v - c.K_e * wm) * c.per_L, (v - c.K_e * w1) * c.per_L
+def winding(i0: float, v: float, speed: Over, k: Lag, c: Coefficients) -> tuple[float, float]:
+    """L_a di/dt = v - R_a i - K_e ω, thesis (3.5), over one step.
+
+    Args:
+        i0: [A] current at the start.
+        v: [V] voltage, constant.
+        speed: [rad/s] ω.
+        k: weights of the winding.
+        c: coefficients.
+
+    Returns:
+        [A] current in the middle and at the end.
+    """
+    g0, gm, g1 = (v - c.K_e * speed.start) * c.per_L, (v - c.K_e * speed.middle) * c.per_L, (
+        v - c.K_e * speed.end) * c.per_L
     return (k.half_decay * i0 + k.u0 * g0 + k.u1 * gm + k.u2 * g1,
             k.decay * i0 + k.w0 * g0 + k.w1 * gm + k.w2 * g1)
 
 
 @equation
-def rotor(w0: float, i0: float, im: float, i1: float, wm: float, w1: float, friction: float,
-          c: Coefficients) -> tuple[float, float]:
-    """J_m dω/dt = K_t i - B_m ω - k_load ω|ω|: speed at h/2 and h, for the current at 0, h/2, h.
+def rotor(current: Over, speed: Over, friction: float, c: Coefficients) -> tuple[float, float]:
+    """J_m dω/dt = K_t i - B_m ω - k_load ω|ω| over one step.
 
-    wm and w1 are guesses that place the slow quadratic load; friction is Coulomb torque over inertia, with its sign.
+    Args:
+        current: [A] i.
+        speed: [rad/s] ω at the start, and estimates of it in the middle and at the end, which give the quadratic load.
+        friction: [rad/s²] Coulomb torque over inertia, with its sign.
+        c: coefficients.
+
+    Returns:
+        [rad/s] speed in the middle and at the end.
     """
-    g0 = c.torque * i0 - c.load * w0 * abs(w0) - friction
-    gm = c.torque * im - c.load * wm * abs(wm) - friction
-    g1 = c.torque * i1 - c.load * w1 * abs(w1) - friction
+    g0 = c.torque * current.start - c.load * speed.start * abs(speed.start) - friction
+    gm = c.torque * current.middle - c.load * speed.middle * abs(speed.middle) - friction
+    g1 = c.torque * current.end - c.load * speed.end * abs(speed.end) - friction
     k = c.rotor
-    return (k.half_decay * w0 + k.u0 * g0 + k.u1 * gm + k.u2 * g1,
-            k.decay * w0 + k.w0 * g0 + k.w1 * gm + k.w2 * g1)
+    return (k.half_decay * speed.start + k.u0 * g0 + k.u1 * gm + k.u2 * g1,
+            k.decay * speed.start + k.w0 * g0 + k.w1 * gm + k.w2 * g1)
 
 
 @equation
 def winding_rotor(i0: float, w0: float, v: float, heat: float, c: Coefficients, e: Values | None,
                   x: Extra | None) -> tuple[float, float, float, float]:
-    """Winding and rotor together over one hold: (i(h/2), i(h), ω(h/2), ω(h)), by two sweeps over the pair."""
+    """Winding and rotor together over one step, by two sweeps over the pair.
+
+    Args:
+        i0: [A] current at the start.
+        w0: [rad/s] speed at the start.
+        v: [V] voltage, constant.
+        heat: [A²s] state of `winding_heating` in the middle.
+        c: coefficients.
+        e: effects.
+        x: coefficients of the effects.
+
+    Returns:
+        Current in the middle and at the end, speed in the middle and at the end.
+    """
     friction, sticks = 0.0, False
     if e is not None and e.rotor_friction_torque > 0.0:
         friction = e.rotor_friction_torque / x.J_m
@@ -211,21 +257,31 @@ def winding_rotor(i0: float, w0: float, v: float, heat: float, c: Coefficients, 
         k, drop, pieces = linearised_winding(i0, v - c.K_e * w0, heat, c, e, x)
     for _ in range(2):
         if e is not None and pieces > 1:
-            im, i1 = brush_winding(i0, v, w0, wm, w1, heat, pieces, c, e, x)
+            im, i1 = brush_winding(i0, v, Over(w0, wm, w1), heat, pieces, c, e, x)
         else:
-            im, i1 = winding(i0, v - drop, w0, wm, w1, k, c)
+            im, i1 = winding(i0, v - drop, Over(w0, wm, w1), k, c)
         if sticks:
-            wm, w1 = breakaway(c.torque * i0, c.torque * im, c.torque * i1, abs(friction), 0.5 * c.h)
+            wm, w1 = breakaway(Over(c.torque * i0, c.torque * im, c.torque * i1), abs(friction), 0.5 * c.h)
         else:
-            wm, w1 = rotor(w0, i0, im, i1, wm, w1, friction, c)
+            wm, w1 = rotor(Over(i0, im, i1), Over(w0, wm, w1), friction, c)
     if e is not None and not sticks and friction * w1 < 0.0:
-        wm, w1 = wm if w0 * wm > 0.0 else 0.0, 0.0  # it stops; whether it turns again the next step decides
+        wm, w1 = wm if w0 * wm > 0.0 else 0.0, 0.0  # it stops; the next step decides whether it turns again
     return im, i1, wm, w1
 
 
 @equation
-def breakaway(d0: float, dm: float, d1: float, limit: float, s: float) -> tuple[float, float]:
-    """Speed after s and 2s of a rotor that sticks until |drive| > limit, for the drive at 0, s, 2s, linear between."""
+def breakaway(drive: Over, limit: float, s: float) -> tuple[float, float]:
+    """Speed of a rotor that sticks until |drive| > limit, for a drive that is linear between its values.
+
+    Args:
+        drive: [rad/s²] torque over inertia.
+        limit: [rad/s²] friction torque over inertia.
+        s: [s] half of the step.
+
+    Returns:
+        [rad/s] speed in the middle and at the end.
+    """
+    d0, dm, d1 = drive
     a, b = abs(dm) - limit, abs(d1) - limit
     if a > 0.0:
         wm = 0.5 * s * a * a / (abs(dm) - abs(d0))
@@ -249,11 +305,16 @@ def linearised_winding(i0: float, v: float, heat: float, c: Coefficients, e: Val
     """The winding with brushes and heat, v - v_brush tanh(i/0.02) - R(T) i - K_e ω, made linear around i0.
 
     Args:
-        i0: current; v: voltage less back-EMF; heat: T in the middle; c, e, x: coefficients.
+        i0: [A] current at the start.
+        v: [V] voltage minus back-EMF.
+        heat: [A²s] T in the middle of the step.
+        c: coefficients.
+        e: effects.
+        x: coefficients of the effects.
 
     Returns:
-        Its weights, the constant part of the brush drop, and into how many pieces the hold must be cut because the
-        current crosses the bend of the tanh.
+        The weights of the winding, the constant part of the brush drop (V), and the number of pieces into which the
+        step must be cut: more than one if the current crosses the bend of the tanh.
     """
     resistance = x.R_total + x.R_a * e.winding_heating_gain * heat
     if e.brush_drop_v_brush == 0.0:
@@ -270,9 +331,24 @@ def linearised_winding(i0: float, v: float, heat: float, c: Coefficients, e: Val
 
 
 @equation
-def brush_winding(i0: float, v: float, w0: float, wm: float, w1: float, heat: float, pieces: int, c: Coefficients,
-                  e: Values, x: Extra | None) -> tuple[float, float]:
-    """As `winding`, the hold cut in pieces, made linear in each (exponential Rosenbrock-Euler method)."""
+def brush_winding(i0: float, v: float, speed: Over, heat: float, pieces: int, c: Coefficients, e: Values,
+                  x: Extra | None) -> tuple[float, float]:
+    """As `winding`, the step cut into pieces, and made linear in each (exponential Rosenbrock-Euler method).
+
+    Args:
+        i0: [A] current at the start.
+        v: [V] voltage, constant.
+        speed: [rad/s] ω.
+        heat: [A²s] T in the middle of the step.
+        pieces: number of pieces; an odd number is raised by one.
+        c: coefficients.
+        e: effects.
+        x: coefficients of the effects.
+
+    Returns:
+        [A] current in the middle and at the end.
+    """
+    w0, wm, w1 = speed
     resistance = x.R_total + x.R_a * e.winding_heating_gain * heat
     pieces += pieces % 2
     h = c.h / pieces
@@ -308,14 +384,28 @@ def static_thrust_near(w: float, w0: float, f0: float, c: Coefficients, e: Value
 
 
 @equation
-def arm_drive(sin_theta: float, theta: float, theta_dot: float, f: float, w: float, flex: float, flex_dot: float,
-              gust: float, c: Coefficients, e: Values | None) -> float:
-    """Torque on the arm over its inertia, less dry friction: -(mgd/J) sin θ - (c/J) θ̇ + (L/J) f, thesis (3.2)."""
+def arm_drive(sin_theta: float, motion: Motion, f: float, w: float, gust: float, c: Coefficients,
+              e: Values | None) -> float:
+    """Torque on the arm over its inertia, without dry friction: -(mgd/J) sin θ - (c/J) θ̇ + (L/J) f, thesis (3.2).
+
+    Args:
+        sin_theta: sine of the angle.
+        motion: of arm and mast.
+        f: [N] thrust.
+        w: [rad/s] speed of the rotor.
+        gust: [rad/s²] further torque over inertia.
+        c: coefficients.
+        e: effects.
+
+    Returns:
+        [rad/s²] torque over inertia.
+    """
     if e is None:
-        return (c.lever * f - c.damping * theta_dot) - c.gravity * sin_theta
-    damping = c.damping + c.lever * e.axial_inflow_k * w + e.quadratic_drag_k * abs(theta_dot)
-    other = gust - e.cable_torque_k * (theta - e.cable_torque_theta0) + flex_restoring(flex, flex_dot, e)
-    return ((c.lever * f - damping * theta_dot) - c.gravity * sin_theta) + other
+        return (c.lever * f - c.damping * motion.theta_dot) - c.gravity * sin_theta
+    damping = c.damping + c.lever * e.axial_inflow_k * w + e.quadratic_drag_k * abs(motion.theta_dot)
+    other = gust - e.cable_torque_k * (motion.theta - e.cable_torque_theta0) + flex_restoring(motion.flex,
+                                                                                             motion.flex_dot, e)
+    return ((c.lever * f - damping * motion.theta_dot) - c.gravity * sin_theta) + other
 
 
 @equation
@@ -343,60 +433,76 @@ def flex_restoring(flex: float, flex_dot: float, e: Values) -> float:
 
 
 @equation
-def arm(y: float, yd: float, q: float, qd: float, f0: float, fm: float, f1: float, w0: float, wm: float, w1: float,
-        friction: float, gust: float, c: Coefficients, e: Values | None, x: Extra | None
-        ) -> tuple[float, float, float, float]:
-    """The arm, and the mast's mode, over one hold by the Runge-Kutta-Nyström method of fourth order.
+def arm(motion: Motion, thrust: Over, speed: Over, friction: float, gust: float, c: Coefficients, e: Values | None,
+        x: Extra | None) -> Motion:
+    """The arm, and the mode of the mast, over one step by the Runge-Kutta-Nyström method of fourth order.
 
     Args:
-        y: θ; yd: θ̇; q: deflection of the mast; qd: its rate.
-        f0: thrust at 0, and fm, f1 at h/2, h; w0, wm, w1: speed.
-        friction: dry friction over inertia, with the sign of the motion.
-        gust: random torque over inertia, held.
+        motion: at the start.
+        thrust: [N] thrust, without the ground effect.
+        speed: [rad/s] speed of the rotor.
+        friction: [rad/s²] dry friction over inertia, with the sign of the motion.
+        gust: [rad/s²] random torque over inertia, constant.
         c: coefficients.
         e: effects.
+        x: coefficients of the effects.
 
     Returns:
-        θ, θ̇, q, q̇ at h.
+        The motion at the end.
     """
+    y, yd, q, qd = motion
     s = 0.5 * c.h
-    # One sine and cosine, in the middle; those of the ends by turning it: the stages need not wait for each other.
-    # So with the ground effect: where the arm would be without acceleration, then moved a little.
+    torque = gust - friction
+    # One sine and cosine, in the middle. Those of the ends follow by rotation, so that the stages need not wait for
+    # each other. The ground effect likewise: where the arm would be without acceleration, then moved a little.
     d = s * yd
     sin_m, cos_m = sine_cosine(y + d)
     d2 = d * d
     sin_d, cos_d = d * (1.0 - d2 * (1.0 / 6.0 - d2 * (1.0 / 120.0))), 1.0 - d2 * (0.5 - d2 * (1.0 / 24.0))
     sin_1, cos_1 = sin_m * cos_d + cos_m * sin_d, cos_m * cos_d - sin_m * sin_d
     g0, gm, g1 = near_ground(y, e), near_ground(y + d, e), near_ground(y + 2.0 * d, e)
-    f0 += f0 * g0
-    a1, b1 = arm_stage(sin_m * cos_d - cos_m * sin_d, y, yd, q, qd, f0, w0, friction, gust, c, e, x)
+    f0 = thrust.start + thrust.start * g0
+    a1, b1 = arm_stage(sin_m * cos_d - cos_m * sin_d, motion, f0, speed.start, torque, c, e, x)
     bend = 0.5 * s * s * a1
     sin_m, middle, qm = near(sin_m, cos_m, bend), y + d + bend, q + s * (qd + 0.5 * s * b1)
-    fm += fm * nearer_ground(gm, y + d, middle, e, x)
-    a2, b2 = arm_stage(sin_m, middle, yd + s * a1, qm, qd + s * b1, fm, wm, friction, gust, c, e, x)
-    a3, b3 = arm_stage(sin_m, middle, yd + s * a2, qm, qd + s * b2, fm, wm, friction, gust, c, e, x)
+    fm = thrust.middle + thrust.middle * nearer_ground(gm, y + d, middle, e, x)
+    a2, b2 = arm_stage(sin_m, Motion(middle, yd + s * a1, qm, qd + s * b1), fm, speed.middle, torque, c, e, x)
+    a3, b3 = arm_stage(sin_m, Motion(middle, yd + s * a2, qm, qd + s * b2), fm, speed.middle, torque, c, e, x)
     bend = c.h * s * a3
     end = y + 2.0 * d + bend
-    a4, b4 = arm_stage(near(sin_1, cos_1, bend), end, yd + c.h * a3, q + c.h * (qd + s * b3), qd + c.h * b3,
-                       f1 + f1 * nearer_ground(g1, y + 2.0 * d, end, e, x), w1, friction, gust, c, e, x)
-    return (y + c.h * (yd + s * (1.0 / 3.0) * (a1 + a2 + a3)), yd + s * (1.0 / 3.0) * (a1 + 2.0 * (a2 + a3) + a4),
-            q + c.h * (qd + s * (1.0 / 3.0) * (b1 + b2 + b3)), qd + s * (1.0 / 3.0) * (b1 + 2.0 * (b2 + b3) + b4))
+    last = Motion(end, yd + c.h * a3, q + c.h * (qd + s * b3), qd + c.h * b3)
+    f1 = thrust.end + thrust.end * nearer_ground(g1, y + 2.0 * d, end, e, x)
+    a4, b4 = arm_stage(near(sin_1, cos_1, bend), last, f1, speed.end, torque, c, e, x)
+    return Motion(
+        y + c.h * (yd + s * (1.0 / 3.0) * (a1 + a2 + a3)), yd + s * (1.0 / 3.0) * (a1 + 2.0 * (a2 + a3) + a4),
+        q + c.h * (qd + s * (1.0 / 3.0) * (b1 + b2 + b3)), qd + s * (1.0 / 3.0) * (b1 + 2.0 * (b2 + b3) + b4))
 
 
 @equation
-def arm_stage(sin_y: float, y: float, yd: float, q: float, qd: float, f: float, w: float, friction: float, gust: float,
-              c: Coefficients, e: Values | None, x: Extra | None) -> tuple[float, float]:
-    """Accelerations (θ̈, q̈): the mast's mode carries a share of the arm's inertia and acts back with -q̈."""
-    drive = arm_drive(sin_y, y, yd, f, w, q, qd, gust - friction, c, e)
+def arm_stage(sin_theta: float, motion: Motion, f: float, w: float, torque: float, c: Coefficients, e: Values | None,
+              x: Extra | None) -> tuple[float, float]:
+    """Accelerations (θ̈, q̈): the mode of the mast carries a share of the arm's inertia and acts back with -q̈.
+
+    Args:
+        sin_theta: sine of the angle.
+        motion: of arm and mast.
+        f: [N] thrust.
+        w: [rad/s] speed of the rotor.
+        torque: [rad/s²] gust minus dry friction.
+        c: coefficients.
+        e: effects.
+        x: coefficients of the effects.
+    """
+    drive = arm_drive(sin_theta, motion, f, w, torque, c, e)
     if e is None:
         return drive, 0.0
     acceleration = drive * x.per_free_inertia
-    return acceleration, -flex_restoring(q, qd, e) - e.mast_flex_coupling * acceleration
+    return acceleration, -flex_restoring(motion.flex, motion.flex_dot, e) - e.mast_flex_coupling * acceleration
 
 
 @equation
 def mast_alone(q: float, qd: float, c: Coefficients, e: Values) -> tuple[float, float]:
-    """The mast's mode over one hold while the arm sticks: q, q̇ at h, as in `arm`."""
+    """The mode of the mast over one step while the arm sticks: q, q̇ at the end, as in `arm`."""
     s = 0.5 * c.h
     b1 = -flex_restoring(q, qd, e)
     qm = q + s * (qd + 0.5 * s * b1)
@@ -407,40 +513,64 @@ def mast_alone(q: float, qd: float, c: Coefficients, e: Values) -> tuple[float, 
 
 
 @equation
-def arm_with_dry_friction(y: float, yd: float, q: float, qd: float, f0: float, fm: float, f1: float, w0: float,
-                          wm: float, w1: float, gust: float, c: Coefficients, e: Values,
-                          x: Extra | None) -> tuple[float, float, float, float]:
+def arm_with_dry_friction(motion: Motion, thrust: Over, speed: Over, gust: float, c: Coefficients, e: Values,
+                          x: Extra | None) -> Motion:
     """As `arm`, with Coulomb friction.
 
-    Where the motion reverses, the hold is cut at that instant, and the arm sticks there unless it is driven harder than
-    friction holds.
+    Where the motion reverses, the step is cut at that instant. There the arm sticks, unless the drive is greater than
+    the friction.
+
+    Args:
+        motion: at the start.
+        thrust: [N] thrust, without the ground effect.
+        speed: [rad/s] speed of the rotor.
+        gust: [rad/s²] random torque over inertia, constant.
+        c: coefficients.
+        e: effects.
+        x: coefficients of the effects.
+
+    Returns:
+        The motion at the end.
     """
+    y, yd, q, qd = motion
     limit = e.coulomb_friction_accel
     direction = 1.0 if yd > 0.0 else -1.0
     if yd == 0.0:
-        drive = arm_drive(math.sin(y), y, 0.0, f0 * (1.0 + near_ground(y, e)), w0, q, qd, gust, c, e)
+        drive = arm_drive(math.sin(y), motion, thrust.start * (1.0 + near_ground(y, e)), speed.start, gust, c, e)
         if abs(drive) <= limit:  # it sticks; the mast swings on alone
             q, qd = mast_alone(q, qd, c, e)
-            return y, 0.0, q, qd
+            return Motion(y, 0.0, q, qd)
         direction = 1.0 if drive > 0.0 else -1.0
-    y1, yd1, q1, qd1 = arm(y, yd, q, qd, f0, fm, f1, w0, wm, w1, direction * limit, gust, c, e, x)
-    if yd == 0.0 or yd * yd1 > 0.0:
-        return y1, yd1, q1, qd1
-    reached = yd / (yd - yd1) if yd != yd1 else 1.0
-    y1 = y + 0.5 * reached * c.h * yd
-    f = (f0 + reached * (f1 - f0)) * (1.0 + near_ground(y1, e))
-    drive = arm_drive(math.sin(y1), y1, 0.0, f, w1, q1, qd1, gust, c, e)
+    after = arm(motion, thrust, speed, direction * limit, gust, c, e, x)
+    if yd == 0.0 or yd * after.theta_dot > 0.0:
+        return after
+    reached = yd / (yd - after.theta_dot) if yd != after.theta_dot else 1.0
+    turn = y + 0.5 * reached * c.h * yd
+    f = (thrust.start + reached * (thrust.end - thrust.start)) * (1.0 + near_ground(turn, e))
+    resting = Motion(turn, 0.0, after.flex, after.flex_dot)
+    drive = arm_drive(math.sin(turn), resting, f, speed.end, gust, c, e)
     if abs(drive) <= limit:
-        return y1, 0.0, q1, qd1
+        return resting
     rest = (1.0 - reached) * c.h
     acceleration = (drive - limit if drive > 0.0 else drive + limit) * x.per_free_inertia
-    return y1 + 0.5 * rest * rest * acceleration, rest * acceleration, q1, qd1
+    return Motion(turn + 0.5 * rest * rest * acceleration, rest * acceleration, after.flex, after.flex_dot)
 
 
 @equation
 def advance_motor(state: State, v: float, c: Coefficients, e: Values | None, x: Extra | None
                   ) -> tuple[float, float, float, float, float]:
-    """Winding and rotor over one step of v: current, speed at h/2 and h, angle turned, heat."""
+    """Winding and rotor over one step.
+
+    Args:
+        state: at the start.
+        v: [V] voltage, constant.
+        c: coefficients.
+        e: effects.
+        x: coefficients of the effects.
+
+    Returns:
+        Current at the end, speed in the middle and at the end, rotor angle and heat at the end.
+    """
     i0, w0 = state.i_a, state.omega
     heat = state.heat
     if e is not None and e.winding_heating_gain > 0.0:
@@ -456,14 +586,26 @@ def advance_motor(state: State, v: float, c: Coefficients, e: Values | None, x: 
 
 @equation
 def advance_arm(state: State, wm: float, w1: float, c: Coefficients, e: Values | None, x: Extra | None
-                ) -> tuple[float, float, float, float, float]:
-    """Air and arm over one step, for the speed at 0 (in the state), h/2 and h: θ, θ̇, thrust, q, q̇."""
-    w0, y, yd = state.omega, state.theta, state.theta_dot
+                ) -> tuple[Motion, float]:
+    """Air and arm over one step.
+
+    Args:
+        state: at the start.
+        wm: [rad/s] speed of the rotor in the middle.
+        w1: [rad/s] speed of the rotor at the end.
+        c: coefficients.
+        e: effects.
+        x: coefficients of the effects.
+
+    Returns:
+        The motion and the thrust (N) at the end.
+    """
+    w0 = state.omega
+    speed = Over(w0, wm, w1)
     f0 = static_thrust(w0, c, e)
     fm, f1 = static_thrust_near(wm, w0, f0, c, e), static_thrust_near(w1, w0, f0, c, e)
     if e is None:
-        y, yd, _, _ = arm(y, yd, 0.0, 0.0, f0, fm, f1, w0, wm, w1, 0.0, 0.0, c, e, x)
-        return y, yd, f1, 0.0, 0.0
+        return arm(Motion(state.theta, state.theta_dot, 0.0, 0.0), Over(f0, fm, f1), speed, 0.0, 0.0, c, e, x), f1
     if e.thrust_lag_tau > NO_LAG * c.h:
         k = x.air
         a = 1.0 / e.thrust_lag_tau
@@ -471,12 +613,10 @@ def advance_arm(state: State, wm: float, w1: float, c: Coefficients, e: Values |
         f0 = state.thrust
         fm, f1 = (k.half_decay * f0 + k.u0 * s0 + k.u1 * sm + k.u2 * s1,
                   k.decay * f0 + k.w0 * s0 + k.w1 * sm + k.w2 * s1)
-    q, qd = state.flex, state.flex_dot
+    motion = Motion(state.theta, state.theta_dot, state.flex, state.flex_dot)
     if e.coulomb_friction_accel > 0.0:
-        y, yd, q, qd = arm_with_dry_friction(y, yd, q, qd, f0, fm, f1, w0, wm, w1, state.gust, c, e, x)
-    else:
-        y, yd, q, qd = arm(y, yd, q, qd, f0, fm, f1, w0, wm, w1, 0.0, state.gust, c, e, x)
-    return y, yd, f1, q, qd
+        return arm_with_dry_friction(motion, Over(f0, fm, f1), speed, state.gust, c, e, x), f1
+    return arm(motion, Over(f0, fm, f1), speed, 0.0, state.gust, c, e, x), f1
 
 
 @equation
@@ -487,11 +627,12 @@ def advance(state: State, v: float, c: Coefficients, e: Values | None, x: Extra 
         state: at the start.
         v: voltage at the bridge, held (`actuator.acting_voltage`).
         c: coefficients.
-        e: effects, and x, their coefficients; None twice for the nominal plant.
+        e: effects; None for the nominal plant.
+        x: coefficients of the effects; None for the nominal plant.
     """
     i1, wm, w1, angle, heat = advance_motor(state, v, c, e, x)
-    y, yd, f1, q, qd = advance_arm(state, wm, w1, c, e, x)
-    return State(i1, w1, angle, y, yd, f1, heat, q, qd, state.gust)
+    m, f1 = advance_arm(state, wm, w1, c, e, x)
+    return State(i1, w1, angle, m.theta, m.theta_dot, f1, heat, m.flex, m.flex_dot, state.gust)
 
 
 def steady(model: Model, duty: float) -> State:
@@ -560,6 +701,22 @@ class Trajectory(NamedTuple):
     thrust: Array
 
 
+class _Rows(NamedTuple):
+    """Rows of the arrays that `run` fills and `Trajectory` names."""
+
+    theta: int = 0
+    theta_dot: int = 1
+    i_a: int = 2
+    omega: int = 3
+    v_a: int = 4
+    rotor_angle: int = 5
+    thrust: int = 6
+
+
+ROW = _Rows()
+"""Row of each quantity in an array of states (7, N), as `run` fills it."""
+
+
 @njit()
 def linear_arm(stiffness: float, damping: float, h: float) -> tuple[float, float, float, float, float, float]:
     """Transition of the arm, made linear around a motion, over a short time, to second order in the time.
@@ -582,14 +739,28 @@ def linear_arm(stiffness: float, damping: float, h: float) -> tuple[float, float
 
 @njit(nogil=True)
 def run(v: Array, noise: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
-    """Record the state at the start of each hold in out (7, N), advance over it; return the state after the last."""
+    """Advance the plant over N holds.
+
+    Args:
+        v: (N,) [V] voltage at the bridge, held (`actuator.acting_voltage`).
+        noise: (N,) standard normal numbers for `gust`.
+        state: at the first sample.
+        c: coefficients.
+        e: effects; None for the nominal plant.
+        x: coefficients of the effects; None for the nominal plant.
+        out: (7, N), filled with the states at the start of each hold, in the order of `Trajectory`.
+
+    Returns:
+        The state after the last hold.
+    """
     for k in range(v.shape[0]):
-        out[0, k], out[1, k], out[2, k], out[3, k] = state.theta, state.theta_dot, state.i_a, state.omega
-        out[5, k], out[6, k] = state.rotor_angle, state.thrust
+        out[ROW.theta, k], out[ROW.theta_dot, k] = state.theta, state.theta_dot
+        out[ROW.i_a, k], out[ROW.omega, k] = state.i_a, state.omega
+        out[ROW.rotor_angle, k], out[ROW.thrust, k] = state.rotor_angle, state.thrust
         if e is None:
-            out[4, k] = v[k]
+            out[ROW.v_a, k] = v[k]
         else:
-            out[4, k] = v[k] - e.supply_sag_r_supply * state.i_a
+            out[ROW.v_a, k] = v[k] - e.supply_sag_r_supply * state.i_a
         for _ in range(c.steps):
             state = advance(state, v[k], c, e, x)
         if e is not None:
@@ -601,22 +772,46 @@ def run(v: Array, noise: Array, state: State, c: Coefficients, e: Values | None,
 
 @njit(nogil=True)
 def run_arm(speed: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
-    """Air and arm alone, for a given speed (N,), linear between samples; fills out (2, N) with θ, θ̇."""
+    """Air and arm alone, for a given speed of the rotor, linear between samples.
+
+    Args:
+        speed: (N,) [rad/s] speed at the samples.
+        state: at the first sample.
+        c: coefficients.
+        e: effects; None for the nominal plant.
+        x: coefficients of the effects; None for the nominal plant.
+        out: (2, N), filled with θ, θ̇.
+
+    Returns:
+        The state after the last sample.
+    """
     for k in range(speed.shape[0]):
         out[0, k], out[1, k] = state.theta, state.theta_dot
         w = speed[k]
         rise = (speed[min(k + 1, speed.shape[0] - 1)] - w) / c.steps
         for _ in range(c.steps):
             now = State(0.0, w, 0.0, state.theta, state.theta_dot, state.thrust, 0.0, state.flex, state.flex_dot, 0.0)
-            y, yd, f1, q, qd = advance_arm(now, w + 0.5 * rise, w + rise, c, e, x)
+            m, f1 = advance_arm(now, w + 0.5 * rise, w + rise, c, e, x)
             w += rise
-            state = State(0.0, w, 0.0, y, yd, f1, 0.0, q, qd, 0.0)
+            state = State(0.0, w, 0.0, m.theta, m.theta_dot, f1, 0.0, m.flex, m.flex_dot, 0.0)
     return state
 
 
 @njit(nogil=True)
 def run_motor(v: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
-    """Winding and rotor alone, for the voltage at the terminals (N,), held; fills out (3, N) with i_a, ω, angle."""
+    """Winding and rotor alone, for a given voltage at the motor's terminals.
+
+    Args:
+        v: (N,) [V] voltage, held.
+        state: at the first sample.
+        c: coefficients.
+        e: effects; None for the nominal plant.
+        x: coefficients of the effects; None for the nominal plant.
+        out: (3, N), filled with i_a, ω, rotor angle.
+
+    Returns:
+        The state after the last sample.
+    """
     for k in range(v.shape[0]):
         out[0, k], out[1, k], out[2, k] = state.i_a, state.omega, state.rotor_angle
         for _ in range(c.steps):
@@ -646,100 +841,5 @@ def simulate(model: Model, duty: Array, period: float = SAMPLE_PERIOD, state: St
     c, e, x = prepare(model, period)
     run(v, np.zeros(len(duty)) if noise is None else noise, State() if state is None else state, c, e, x, out)
     if "command_delay" in model.effects:
-        out[4] += sampled - v
+        out[ROW.v_a] += sampled - v
     return Trajectory(*out)
-
-
-LANES = 16
-"""Models that advance side by side in `squared_errors`."""
-
-_MAP, _STATE, _ERRORS, _VOLTAGE, _ROWS = 26, 30, 36, 40, 41
-
-
-@equation
-def _lane(a: Array, j: int) -> Coefficients:
-    n = LANES
-    return Coefficients(
-        1, a[j], Lag(a[n + j], a[2 * n + j], a[3 * n + j], a[4 * n + j], a[5 * n + j], a[6 * n + j], a[7 * n + j],
-                  a[8 * n + j]),
-        Lag(a[9 * n + j], a[10 * n + j], a[11 * n + j], a[12 * n + j], a[13 * n + j], a[14 * n + j], a[15 * n + j],
-            a[16 * n + j]),
-        a[17 * n + j], a[18 * n + j], a[19 * n + j], a[20 * n + j], a[21 * n + j], a[22 * n + j], a[23 * n + j],
-        a[24 * n + j], a[25 * n + j])
-
-
-@equation
-def _lane_state(a: Array, j: int) -> State:
-    n = LANES
-    return State(a[_STATE * n + j], a[(_STATE + 1) * n + j], 0.0, a[(_STATE + 3) * n + j], a[(_STATE + 4) * n + j],
-                 a[(_STATE + 5) * n + j], 0.0, 0.0, 0.0, 0.0)
-
-
-@equation
-def _advance_lane(a: Array, j: int, x: State, v: float) -> None:
-    n = LANES
-    y = advance(x, v, _lane(a, j), None, None)
-    a[_STATE * n + j] = y.i_a
-    a[(_STATE + 1) * n + j] = y.omega
-    a[(_STATE + 3) * n + j] = y.theta
-    a[(_STATE + 4) * n + j] = y.theta_dot
-    a[(_STATE + 5) * n + j] = y.thrust
-
-
-@njit(parallel=True)
-def _squared_errors(duty: Array, measured: Array, steps: int, table: Array) -> None:
-    """One row of `table` is a block of models: row r of model j is at r LANES + j, so that lanes are SIMD lanes."""
-    n = LANES
-    for block in prange(table.shape[0]):
-        a = table[block]
-        for k in range(duty.shape[0]):
-            if k == 0 or duty[k] != duty[k - 1]:
-                for j in range(n):
-                    root = math.sqrt(a[(_MAP + 2) * n + j] * duty[k] + a[(_MAP + 3) * n + j])
-                    a[_VOLTAGE * n + j] = max(0.0, a[_MAP * n + j] + a[(_MAP + 1) * n + j] * root)
-            m0, m1, m2, m3 = measured[0, k], measured[1, k], measured[2, k], measured[3, k]
-            for j in range(n):
-                v = a[_VOLTAGE * n + j]
-                x = _lane_state(a, j)
-                a[_ERRORS * n + j] += (x.theta - m0) * (x.theta - m0)
-                a[(_ERRORS + 1) * n + j] += (x.omega - m1) * (x.omega - m1)
-                a[(_ERRORS + 2) * n + j] += (x.i_a - m2) * (x.i_a - m2)
-                a[(_ERRORS + 3) * n + j] += (v - m3) * (v - m3)
-                _advance_lane(a, j, x, v)
-            for _ in range(steps - 1):
-                for j in range(n):
-                    _advance_lane(a, j, _lane_state(a, j), a[_VOLTAGE * n + j])
-
-
-def squared_errors(models: Sequence[Model], duty: Array, measured: Array, period: float = SAMPLE_PERIOD,
-                   states: Sequence[State] | None = None) -> Array:
-    """Sums of squared errors of many nominal models against one recording, on every core.
-
-    Args:
-        models: M models; of their effects only `parameter_mismatch` is allowed.
-        duty: (N,) 0..1, held.
-        measured: (4, N) θ, ω, i_a, v_a, without NaN.
-        period: s.
-        states: M states at the first sample; at rest by default.
-
-    Returns:
-        (M, 4) sums over the samples.
-
-    Raises:
-        ValueError: a model has effects.
-    """
-    if any(id_ != PARAMETER_MISMATCH and is_active(id_, p) for model in models for id_, p in model.effects.items()):
-        raise ValueError("squared_errors simulates nominal models only; use simulate for effects")
-    blocks = -(-len(models) // LANES)
-    steps = max((steps_in(model, period) for model in models), default=1)
-    rows = np.zeros((blocks * LANES, _ROWS))
-    for j in range(len(rows)):
-        m = min(j, len(models) - 1)  # the last block is filled up with the last model
-        numbers = models[m].numbers()
-        c = prepare(models[m], period, steps)[0]
-        rows[j, :_STATE] = [c.h, *c.winding, *c.rotor, *c[4:], *(numbers[key] for key in ("k0", "k1", "k2", "k3"))]
-        rows[j, _STATE:_ERRORS] = (states[m] if states is not None else State())[:6]
-    table = np.ascontiguousarray(rows.reshape(blocks, LANES, _ROWS).transpose(0, 2, 1)).reshape(blocks, _ROWS * LANES)
-    _squared_errors(np.ascontiguousarray(duty, dtype=float), np.ascontiguousarray(measured, dtype=float), steps, table)
-    errors = table.reshape(blocks, _ROWS, LANES)[:, _ERRORS:_VOLTAGE]
-    return errors.transpose(0, 2, 1).reshape(-1, 4)[:len(models)]

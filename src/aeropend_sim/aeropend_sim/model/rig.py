@@ -25,13 +25,14 @@ class Sample(NamedTuple):
 
 
 class Truth(NamedTuple):
-    """The state at that instant before the measurement chain: rad, rad/s, A, rad/s, V."""
+    """The state at that instant before the measurement chain: rad, rad/s, A, rad/s, V, rad."""
 
     theta: float
     theta_dot: float
     i_a: float
     omega: float
     v_a: float
+    rotor_angle: float
 
 
 class Rig:
@@ -75,7 +76,7 @@ class Rig:
         self._past = known[-self._history:]
         truth, read = np.empty((7, n)), np.empty((4, n))
         self._state = dynamics.run(v, self._kicks.standard_normal(n), self._state, *self._plant, truth)
-        truth[4] += sampled - v
+        truth[dynamics.ROW.v_a] += sampled - v
         self._memory = sensing.read(read, truth, self._normal.standard_normal((n, 4)), self._uniform.random((n, 2)),
                                     self._memory, self._count == 0, self._chain)
         self._count += n
@@ -84,7 +85,7 @@ class Rig:
     def sample(self, duty: float) -> tuple[Sample, Truth]:
         """Read the rig at this instant with a duty (0..1) applied, then advance it over one period."""
         read, truth = self.run(np.array([duty]))
-        return Sample(*read[:, 0].tolist()), Truth(*truth[:5, 0].tolist())
+        return Sample(*read[:, 0].tolist()), Truth(*truth[:len(Truth._fields), 0].tolist())
 
 
 def record(model: Model, duty: Array, seed: int = 0, period: float = SAMPLE_PERIOD

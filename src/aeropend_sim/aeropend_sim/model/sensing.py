@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_sim.compiled import njit
-from aeropend_sim.model.dynamics import NO_LAG, Lag, lag
+from aeropend_sim.model.dynamics import NO_LAG, ROW, Lag, lag
 from aeropend_sim.model.effects import SPIKE_FACTOR
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 
@@ -213,8 +213,8 @@ def read(out: Array, truth: Array, normal: Array, uniform: Array, m: Memory, fir
         The memory after the last sample.
     """
     for k in range(out.shape[1]):
-        theta, theta_dot, i_a, omega, v_a, angle = (truth[0, k], truth[1, k], truth[2, k], truth[3, k], truth[4, k],
-                                                    truth[5, k])
+        theta, theta_dot, i_a = truth[ROW.theta, k], truth[ROW.theta_dot, k], truth[ROW.i_a, k]
+        omega, v_a, angle = truth[ROW.omega, k], truth[ROW.v_a, k], truth[ROW.rotor_angle, k]
         if first:
             m = start(theta, theta_dot, omega, angle, c)
             first = False

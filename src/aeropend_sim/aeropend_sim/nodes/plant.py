@@ -240,16 +240,14 @@ class Plant(Node):
     def _sample(self, stamp_ns: int) -> None:
         with self._lock:
             duty = self._duty
-            reading, state = self._rig.run(np.array([duty]))
-        theta, omega, i_a, v_a = reading[:, 0].tolist()
-        self._joint_states.publish(interface.joint_states_message(stamp_ns, theta, omega))
-        self._armature.publish(interface.armature_message(stamp_ns, v_a, i_a, duty))
+            read, true = self._rig.sample(duty)
+        self._joint_states.publish(interface.joint_states_message(stamp_ns, read.theta, read.omega))
+        self._armature.publish(interface.armature_message(stamp_ns, read.v_a, read.i_a, duty))
         if self._truth:
-            theta, theta_dot, i_a, omega, v_a, rotor_angle, _ = state[:, 0].tolist()
             self._truth_joint_states.publish(
-                interface.joint_states_message(stamp_ns, theta, omega, theta_dot, rotor_angle)
+                interface.joint_states_message(stamp_ns, true.theta, true.omega, true.theta_dot, true.rotor_angle)
             )
-            self._truth_armature.publish(interface.armature_message(stamp_ns, v_a, i_a, duty))
+            self._truth_armature.publish(interface.armature_message(stamp_ns, true.v_a, true.i_a, duty))
         self._samples += 1
 
     def _on_duty(self, message: Float64) -> None:
