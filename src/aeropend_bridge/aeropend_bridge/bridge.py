@@ -13,7 +13,6 @@ the duty is 0 until the next command. What was sent while the node stood still i
 One thread reads the port and publishes. Commands go out from the executor's callbacks, at once or not at all.
 """
 
-import ctypes
 import math
 import sys
 import threading
@@ -22,20 +21,16 @@ from collections.abc import Sequence
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.node import Node
-from sensor_msgs.msg import BatteryState, JointState
-from std_msgs.msg import Float64
-from std_srvs.srv import SetBool
 
 from aeropend_bridge import calibration, protocol
 from aeropend_bridge.clock import BoardClock
 from aeropend_bridge.link import Link, LinkError
 from aeropend_bridge.protocol import Flag, Hello, Mode, Sample, Scheme
 from aeropend_sim.errors import UserError
-from aeropend_sim.ros import interface
 from aeropend_sim.ros.diagnostics import Diagnostics
 from aeropend_sim.ros.program import run
-from aeropend_sim.ros.realtime import CLOCK_STEP_NS, go_before_other_programs, monotonic_to_ros_ns, prepare_thread
+from aeropend_sim.ros.realtime import CLOCK_STEP_NS, prepare_thread, request_realtime_priority
+from aeropend_sim.ros.rig_interface import RigInterface
 from aeropend_sim.ros.settings import Setting, overrides, read_settings
 from aeropend_sim.ros.usage import usage
 from aeropend_sim.ros.worker import Worker
@@ -73,11 +68,11 @@ USAGE = usage(
 )
 
 
-class Bridge(Node):
-    """The node. See the module's docstring for time and commands, and contract section 1 for topics."""
+class Bridge(RigInterface):
+    """The node. See the module's docstring for time and commands, and docs/interfaces.md for topics."""
 
     def __init__(self) -> None:
-        super().__init__("bridge", automatically_declare_parameters_from_overrides=True)
+        super().__init__("bridge")
         settings = read_settings(self, SETTINGS, overrides(self))
         prefix = f"{calibration.SECTION}."
         numbers = {name.removeprefix(prefix): value for name, value in settings.items() if name.startswith(prefix)}
@@ -87,11 +82,7 @@ class Bridge(Node):
         self._receiver = protocol.Receiver()
         latency_ns = protocol.FRAME_NS[self._scheme] + round(self._calibration.latency * 1e9)
         self._clock_of_board = BoardClock(protocol.TICK_NS, latency_ns)
-        self._to_ros = monotonic_to_ros_ns()
-        self._lock = threading.Lock()  # of what commands and samples share
-        self._duty = 0.0
         self._sequence = 0
-        self._enabled = True
         self._settings_sent = self._commanded = 0.0
         self._deaf_until = -math.inf
         self._hello: Hello | None = None
@@ -109,13 +100,8 @@ class Bridge(Node):
         self._gap_max = 0.0
         self._stamp = 0
         self._said = ""
-        self._load = (time.monotonic(), time.process_time())
 
-        qos = interface.QOS
-        self._joint_states = self.create_publisher(JointState, interface.JOINT_STATES, qos)
-        self._armature = self.create_publisher(BatteryState, interface.ARMATURE, qos)
-        self.create_subscription(Float64, interface.DUTY_COMMAND, self._on_duty, qos)
-        self.create_service(SetBool, interface.ENABLE, self._on_enable)
+        self.advertise()
         self._diagnostics = Diagnostics(self, self._report, "aeropendulum's board")
         self._repeat = self.create_timer(REPEAT_S, self._on_repeat, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._worker = Worker(self, self._serve, "samples")
@@ -125,7 +111,7 @@ class Bridge(Node):
         """Stop the motor and let go of the port."""
         self._worker.stop()
         if self._hello is not None:
-            self._duty = 0.0
+            self.duty = 0.0
             self._command()
         self._link.close()
 
@@ -133,7 +119,7 @@ class Bridge(Node):
 
     def _serve(self, end: threading.Event) -> None:
         prepare_thread()
-        go_before_other_programs()
+        request_realtime_priority()
         while not end.is_set():
             self._serve_port(end)
 
@@ -158,8 +144,8 @@ class Bridge(Node):
 
     def _forget_board(self) -> None:
         """The duty is 0 and stays so until the next command."""
-        with self._lock:
-            self._hello, self._last, self._duty = None, None, 0.0
+        with self.lock:
+            self._hello, self._last, self.duty = None, None, 0.0
         self._clock_of_board.restart()
 
     def _converse(self, end: threading.Event) -> None:
@@ -171,7 +157,7 @@ class Bridge(Node):
                 self._ask()
             if now - clock_checked >= 1.0:
                 clock_checked = now
-                self._follow_system_clock()
+                self.follow_system_clock()
             data, arrival_ns = link.read(RETRY_S)
             samples: list[Sample] = []
             for message in receiver.feed(data):
@@ -209,7 +195,7 @@ class Bridge(Node):
             self._counts["board resets"] += 1
             self.get_logger().warn(f"the board was reset ({hello.why_reset()}): duty 0 until the next command")
             self._forget_board()
-        with self._lock:
+        with self.lock:
             self._hello = hello
             self._send_settings()
 
@@ -218,7 +204,7 @@ class Bridge(Node):
         self._link.write(
             protocol.set_mode(Mode.DIRECT)
             + protocol.set_scheme(self._scheme)
-            + protocol.enable(self._enabled)
+            + protocol.enable(self.enabled)
         )
         self._command()
 
@@ -240,7 +226,7 @@ class Bridge(Node):
             if sample is samples[-1]:
                 clock.add(board_ns, arrival_ns)
             if clock.settled:
-                self._publish(sample, clock.host_ns(board_ns) + self._to_ros)
+                self._publish(sample, clock.host_ns(board_ns) + self.to_ros_ns)
         self._heard = time.monotonic()
 
     def _note(self, sample: Sample) -> None:
@@ -258,16 +244,8 @@ class Bridge(Node):
             self._gap_max = max(self._gap_max, gap)
             self.get_logger().warn(f"no samples for {gap:.3f} s")
         self._stamp = stamp_ns
-        self._joint_states.publish(interface.joint_states_message(stamp_ns, theta, omega))
-        self._armature.publish(interface.armature_message(stamp_ns, v_a, i_a, duty))
+        self.publish_sample(stamp_ns, theta, omega, v_a, i_a, duty)
         self._counts["samples"] += 1
-
-    def _follow_system_clock(self) -> None:
-        step = monotonic_to_ros_ns() - self._to_ros
-        if abs(step) > CLOCK_STEP_NS:
-            self._to_ros += step
-            self._counts["clock steps"] += 1
-            self.get_logger().warn(f"the system clock was set: stamps move by {step * 1e-9:.3f} s")
 
     # the executor's callbacks
 
@@ -275,23 +253,17 @@ class Bridge(Node):
         """Send the present duty."""
         self._commanded = time.monotonic()
         self._sequence = (self._sequence + 1) & 0xFF
-        self._link.write(protocol.duty_command(self._sequence, self._duty))
+        self._link.write(protocol.duty_command(self._sequence, self.duty))
 
-    def _on_duty(self, message: Float64) -> None:
-        if not math.isfinite(message.data):
-            self._counts["refused commands"] += 1
-            if self._counts["refused commands"] == 1:
-                self.get_logger().warn(f"duty_command {message.data} refused; further ones are only counted")
-            return
-        duty = ctypes.c_float(min(max(message.data, 0.0), 1.0)).value
-        with self._lock:
-            if self._hello is None:
-                self._counts["commands without board"] += 1
-            elif self._rests_after_stall():
-                self._counts["commands of a stall"] += 1
-            elif self._enabled:
-                self._duty = duty
-                self._command()
+    def take_duty(self, duty: float) -> None:
+        """Send a commanded duty to the board, if there is one and the node did not stand still before."""
+        if self._hello is None:
+            self._counts["commands without board"] += 1
+        elif self._rests_after_stall():
+            self._counts["commands of a stall"] += 1
+        elif self.enabled:
+            self.duty = duty
+            self._command()
 
     def _rests_after_stall(self) -> bool:
         """Set the duty to 0 when this node stood still, and tell whether a command may be from before.
@@ -300,15 +272,15 @@ class Bridge(Node):
         """
         now = time.monotonic()
         since = now - self._commanded
-        if since > protocol.COMMAND_TIMEOUT_S and self._duty > 0.0:
+        if since > protocol.COMMAND_TIMEOUT_S and self.duty > 0.0:
             self._counts["stalls"] += 1
             self.get_logger().warn(f"stood still for {since:.2f} s: duty 0 until the next command")
-            self._duty = 0.0
+            self.duty = 0.0
             self._deaf_until = now + REPEAT_S
         return now < self._deaf_until
 
     def _on_repeat(self) -> None:
-        with self._lock:
+        with self.lock:
             if self._hello is None:
                 return
             self._rests_after_stall()
@@ -317,38 +289,29 @@ class Bridge(Node):
             if self._last is not None and time.monotonic() - self._settings_sent > RETRY_S:
                 flags = self._last.flags
                 told = bool(flags & Flag.ENABLED), bool(flags & Flag.SSI), bool(flags & Flag.PID)
-                if told != (self._enabled, self._scheme == Scheme.SSI, False):
+                if told != (self.enabled, self._scheme == Scheme.SSI, False):
                     self._send_settings()
 
-    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        with self._lock:
-            self._enabled = request.data
-            if not self._enabled:
-                self._duty = 0.0  # and it stays 0 after enabling, until the next command
-            if self._hello is not None:
-                self._send_settings()  # and again until the samples' flags say so
-        response.success = True
-        response.message = "enabled" if request.data else "disabled: duty 0"
-        return response
+    def enabled_changed(self) -> None:
+        """Send the new setting to the board. It is sent again until the flags of the samples show it."""
+        if self._hello is not None:
+            self._send_settings()
 
     def _report(self) -> tuple[str, dict[str, object]]:
-        wall, cpu = time.monotonic(), time.process_time()
-        load = (cpu - self._load[1]) / (wall - self._load[0]) if wall > self._load[0] else 0.0
-        self._load = (wall, cpu)
         self._counts["dropped writes"] = self._link.dropped
         hello, lost = self._hello, self._counts["lost samples"]
-        connected = hello is not None and wall - self._heard < SILENCE_S
+        connected = hello is not None and time.monotonic() - self._heard < SILENCE_S
         values: dict[str, object] = {
             **self._counts,
             "longest gap s": self._gap_max,
             "connected": connected,
-            "enabled": self._enabled,
+            "enabled": self.enabled,
             "port": self._link.port,
             "firmware": ".".join(map(str, hello.firmware)) if hello else "",
             "clock drift ppm": self._clock_of_board.drift * 1e6,
             "clock stops": self._clock_of_board.stops,
             "clock offset s": (self._stamp - self._last_time) * 1e-9,
-            "cpu share": load,
+            "cpu share": self.cpu_share.since_last(),
         }
         if not connected:
             return self._said or f"the board at {self._link.port} says nothing", values

@@ -33,9 +33,9 @@ from aeropend_sim.errors import UserError
 from aeropend_sim.model.parameters import PRESETS, ModelError, load
 from aeropend_sim.model.rig import Sample
 from aeropend_sim.ros import interface
-from aeropend_sim.ros.diagnostics import Diagnostics
+from aeropend_sim.ros.diagnostics import CpuShare, Diagnostics
 from aeropend_sim.ros.program import run
-from aeropend_sim.ros.realtime import go_before_other_programs
+from aeropend_sim.ros.realtime import request_realtime_priority
 from aeropend_sim.ros.settings import Setting, overrides, read_settings
 from aeropend_sim.ros.usage import Usage, usage
 
@@ -127,7 +127,7 @@ class Controller(Node):
         self._longest_ns = 0
         self._malformed = 0  # messages
         self._logged: dict[str, float] = {}
-        self._load = (time.monotonic(), time.process_time())
+        self._cpu_share = CpuShare()
 
         qos = interface.QOS
         self._publisher = self.create_publisher(Float64, interface.DUTY_COMMAND, qos)
@@ -142,7 +142,7 @@ class Controller(Node):
         self.get_logger().info(f"model {values['model']}, {said}")
         gc.collect()
         gc.freeze()  # the collector need not look at all this between two samples
-        go_before_other_programs()
+        request_realtime_priority()
 
     def close(self) -> None:
         """Send duty 0 ten times over 0.2 s: confirmation by the middleware would take up to 3 s (its heartbeat)."""
@@ -270,16 +270,13 @@ class Controller(Node):
                 self._say(warnings[-1])
         if not self._heard and not supervisor.fault:
             warnings.append("no sample yet, which is joint_states and armature with the same stamp: duty 0")
-        wall, cpu = time.monotonic(), time.process_time()
-        load = (cpu - self._load[1]) / (wall - self._load[0]) if wall > self._load[0] else 0.0
-        self._load = (wall, cpu)
         values = {
             "reference": supervisor.reference,
             "duty": supervisor.duty,
             **supervisor.counts,
             "malformed": self._malformed,
             "longest step ms": 1e-6 * self._longest_ns,
-            "cpu share": load,
+            "cpu share": self._cpu_share.since_last(),
         }
         return "; ".join(filter(None, warnings)), values
 

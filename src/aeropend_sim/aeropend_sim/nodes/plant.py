@@ -15,7 +15,6 @@ listeners, though: one that is too slow for the speed loses samples, and the sta
 Every parameter is read at start and fixed while the node runs: a recording belongs to one model.
 """
 
-import ctypes
 import math
 import sys
 import threading
@@ -27,8 +26,7 @@ import numpy as np
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, JointState
-from std_msgs.msg import Float64
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import Trigger
 
 from aeropend_sim.errors import UserError
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
@@ -46,7 +44,8 @@ from aeropend_sim.model.parameters import (
 from aeropend_sim.ros import interface
 from aeropend_sim.ros.diagnostics import Diagnostics
 from aeropend_sim.ros.program import run
-from aeropend_sim.ros.realtime import CLOCK_STEP_NS, go_before_other_programs, monotonic_to_ros_ns, prepare_thread
+from aeropend_sim.ros.realtime import prepare_thread, request_realtime_priority
+from aeropend_sim.ros.rig_interface import RigInterface
 from aeropend_sim.ros.settings import Setting, declare, overrides, read_settings
 from aeropend_sim.ros.usage import usage
 from aeropend_sim.ros.worker import Worker
@@ -157,11 +156,11 @@ class Pace:
         return math.inf
 
 
-class Plant(Node):
-    """The node. See the module's docstring for time, and contract section 1 for topics."""
+class Plant(RigInterface):
+    """The node. See the module's docstring for time, and docs/interfaces.md for topics."""
 
     def __init__(self) -> None:
-        super().__init__("plant", automatically_declare_parameters_from_overrides=True)
+        super().__init__("plant")
         given = overrides(self)
         settings, model = read_parameters(self, given)
         # imported here: compiling can take seconds, and a signal must already be handled by then
@@ -171,27 +170,18 @@ class Plant(Node):
         self._rig.run(np.zeros(1))  # compiles before the first deadline
         self._rig.reset()
         self._speed: float = settings["speed"]
-        self._lock = threading.Lock()  # of the rig and the duty
-        self._duty = 0.0
-        self._enabled = True
-        self._refused = 0
         self._samples = 0
         self._lost = 0
-        self._clock_steps = 0
         self._pace: Pace | None = None
-        self._load = (time.monotonic(), time.process_time())
 
         qos = interface.QOS
-        self._joint_states = self.create_publisher(JointState, interface.JOINT_STATES, qos)
-        self._armature = self.create_publisher(BatteryState, interface.ARMATURE, qos)
+        self.advertise()
         self._truth = settings["publish_truth"]
         if self._truth:
             self._truth_joint_states = self.create_publisher(JointState, interface.TRUTH_JOINT_STATES, qos)
             self._truth_armature = self.create_publisher(BatteryState, interface.TRUTH_ARMATURE, qos)
         if self._speed != 1.0:
             self._clock_publisher = self.create_publisher(Clock, "/clock", qos)
-        self.create_subscription(Float64, interface.DUTY_COMMAND, self._on_duty, qos)
-        self.create_service(SetBool, interface.ENABLE, self._on_enable)
         self.create_service(Trigger, interface.RESET, self._on_reset)
         self._diagnostics = Diagnostics(self, self._report, "simulated aeropendulum")
         effects = ", ".join(model.effects) or "none"
@@ -205,25 +195,19 @@ class Plant(Node):
 
     def _real_time(self, end: threading.Event) -> None:
         prepare_thread()
-        go_before_other_programs()
+        request_realtime_priority()
         pace = self._pace = Pace(PERIOD_NS, BACKLOG)
-        to_ros = monotonic_to_ros_ns()
         while not end.is_set():
             given_up = pace.next()
             if given_up:
                 self._lost += given_up
-                with self._lock:
+                with self.lock:
                     for done in range(0, given_up, 10_000):  # bounds the memory
-                        self._rig.run(np.full(min(given_up - done, 10_000), self._duty))
+                        self._rig.run(np.full(min(given_up - done, 10_000), self.duty))
                 self.get_logger().warn(f"stood still: {given_up} samples lost, {self._lost} in all")
-            self._sample(pace.deadline + to_ros)
+            self._sample(pace.deadline + self.to_ros_ns)
             if self._samples % 490 == 0:
-                step = monotonic_to_ros_ns() - to_ros
-                if abs(step) > CLOCK_STEP_NS:
-                    periods = round(step / PERIOD_NS)
-                    to_ros += periods * PERIOD_NS
-                    self._clock_steps += 1
-                    self.get_logger().warn(f"the system clock was set: stamps move by {periods * SAMPLE_PERIOD:.3f} s")
+                self.follow_system_clock(PERIOD_NS)
 
     def _simulate(self, end: threading.Event) -> None:
         prepare_thread()
@@ -238,11 +222,10 @@ class Plant(Node):
             self._sample(stamp_ns)
 
     def _sample(self, stamp_ns: int) -> None:
-        with self._lock:
-            duty = self._duty
+        with self.lock:
+            duty = self.duty
             read, true = self._rig.sample(duty)
-        self._joint_states.publish(interface.joint_states_message(stamp_ns, read.theta, read.omega))
-        self._armature.publish(interface.armature_message(stamp_ns, read.v_a, read.i_a, duty))
+        self.publish_sample(stamp_ns, read.theta, read.omega, read.v_a, read.i_a, duty)
         if self._truth:
             self._truth_joint_states.publish(
                 interface.joint_states_message(stamp_ns, true.theta, true.omega, true.theta_dot, true.rotor_angle)
@@ -250,50 +233,31 @@ class Plant(Node):
             self._truth_armature.publish(interface.armature_message(stamp_ns, true.v_a, true.i_a, duty))
         self._samples += 1
 
-    def _on_duty(self, message: Float64) -> None:
-        if not math.isfinite(message.data):
-            self._refused += 1
-            if self._refused == 1:
-                self.get_logger().warn(f"duty_command {message.data} refused; further ones are only counted")
-            return
-        # as the 32-bit float that `armature` reports, so that a recording holds exactly what was applied
-        duty = ctypes.c_float(min(max(message.data, 0.0), 1.0)).value
-        with self._lock:
-            if self._enabled:
-                self._duty = duty
-
-    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        with self._lock:
-            self._enabled = request.data
-            if not self._enabled:
-                self._duty = 0.0  # and it stays 0 after enabling, until the next command
-        response.success = True
-        response.message = "enabled" if request.data else "disabled: duty 0"
-        return response
+    def take_duty(self, duty: float) -> None:
+        """Hold a commanded duty, if the rig is enabled."""
+        if self.enabled:
+            self.duty = duty
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        with self._lock:
+        with self.lock:
             self._rig.reset()
-            self._duty = 0.0
+            self.duty = 0.0
         response.success = True
         response.message = "at rest, duty 0"
         return response
 
     def _report(self) -> tuple[str, dict[str, object]]:
-        wall, cpu = time.monotonic(), time.process_time()
-        load = (cpu - self._load[1]) / (wall - self._load[0]) if wall > self._load[0] else 0.0
-        self._load = (wall, cpu)
         pace = self._pace
         values: dict[str, object] = {
             "samples": self._samples,
             "late ticks": pace.late if pace else 0,
             "lost ticks": self._lost,
-            "refused commands": self._refused,
+            "refused commands": self.refused,
             "lateness max ms": pace.max_lateness_ns * 1e-6 if pace else 0.0,
             "lateness p99 ms": pace.percentile_ms(0.99) if pace else 0.0,
-            "clock steps": self._clock_steps,
-            "cpu share": load,
-            "enabled": self._enabled,
+            "clock steps": self.clock_steps,
+            "cpu share": self.cpu_share.since_last(),
+            "enabled": self.enabled,
         }
         return (f"{self._lost} samples lost" if self._lost else ""), values
 

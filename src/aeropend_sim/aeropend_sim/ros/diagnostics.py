@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The counters of a node on `/diagnostics`."""
 
+import time
 from collections.abc import Callable, Mapping
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -9,6 +10,19 @@ from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
 from aeropend_sim.ros import interface
+
+
+class CpuShare:
+    """CPU time of this process over wall time."""
+
+    def __init__(self) -> None:
+        self._last = time.monotonic(), time.process_time()
+
+    def since_last(self) -> float:
+        """CPU share since the last call: 1 is one core."""
+        (wall_before, cpu_before), (wall, cpu) = self._last, (time.monotonic(), time.process_time())
+        self._last = wall, cpu
+        return (cpu - cpu_before) / (wall - wall_before) if wall > wall_before else 0.0
 
 
 class Diagnostics:

@@ -19,11 +19,11 @@ def prepare_thread() -> None:
     gc.freeze()
 
 
-def go_before_other_programs() -> None:
-    """Ask for real-time priority, which root has, and others with a limit on rtprio; without it, do with what there is.
+def request_realtime_priority() -> None:
+    """Ask for real-time priority for all threads of this process. Without the permission, nothing changes.
 
-    Every thread of the process needs it: one that holds a lock the sampling thread waits for would else itself wait for
-    other programs.
+    Root has the permission, and users with a limit on `rtprio`. All threads need the priority: otherwise a thread that
+    holds a lock for which the sampling thread waits would itself wait for other programs.
     """
     with suppress(OSError):
         for thread in Path("/proc/self/task").iterdir():
