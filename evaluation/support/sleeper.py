@@ -9,7 +9,7 @@ import subprocess
 import sys
 
 from aeropend_sim.nodes.plant import BACKLOG, PERIOD_NS, Pace
-from aeropend_sim.ros.realtime import go_before_other_programs, prepare_thread
+from aeropend_sim.ros.realtime import prepare_thread, request_realtime_priority
 
 
 class Sleeper:
@@ -33,7 +33,7 @@ class Sleeper:
 def main() -> int:
     """Sleep until SIGINT."""
     prepare_thread()
-    go_before_other_programs()
+    request_realtime_priority()
     pace, lost = Pace(PERIOD_NS, BACKLOG), 0
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:

@@ -43,7 +43,7 @@ from board import (
 from aeropend_sim.cli.command import Parser
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import PRESETS, Model, ModelError, _Loader, _node_parameters, from_flat, load
-from aeropend_sim.ros.realtime import go_before_other_programs, monotonic_to_ros_ns, prepare_thread
+from aeropend_sim.ros.realtime import monotonic_to_ros_ns, prepare_thread, request_realtime_priority
 
 PERIOD_NS = PERIOD_CYCLES * 1_000_000_000 // CLOCK_HZ
 BACKLOG = 49
@@ -187,7 +187,7 @@ class EmulatedBoard:
         """Run until `stop`."""
         threading.Thread(target=self._read_standard_input, daemon=True).start()
         prepare_thread()
-        go_before_other_programs()
+        request_realtime_priority()
         start = deadline = time.monotonic_ns()
         to_ros = monotonic_to_ros_ns()
         samples = 0

@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -68,6 +69,25 @@ USAGE = usage(
 )
 
 
+@dataclass
+class Counts:
+    """Events since the start of the node. `/diagnostics` has the same names, with spaces."""
+
+    samples: int = 0
+    lost_samples: int = 0
+    reconnects: int = 0
+    board_resets: int = 0
+    gaps: int = 0
+    samples_without_command: int = 0
+    receive_errors_on_the_board: int = 0
+    speed_pulses_rejected: int = 0
+    angles_with_errors: int = 0
+    commands_without_board: int = 0
+    commands_refused_by_the_board: int = 0
+    stalls: int = 0
+    commands_of_a_stall: int = 0
+
+
 class Bridge(RigInterface):
     """The node. See the module's docstring for time and commands, and docs/interfaces.md for topics."""
 
@@ -91,12 +111,7 @@ class Bridge(RigInterface):
         self._last: Sample | None = None
         self._last_time = 0
         self._heard = -math.inf
-        self._counts: dict[str, int] = dict.fromkeys(
-            ("samples", "lost samples", "bad frames", "refused commands", "dropped writes", "reconnects",
-             "board resets", "gaps", "clock steps", "samples without command", "receive errors on the board",
-             "speed pulses rejected", "angles with errors", "commands without board",
-             "commands refused by the board", "stalls", "commands of a stall"), 0
-        )  # fmt: skip
+        self._counts = Counts()
         self._gap_max = 0.0
         self._stamp = 0
         self._said = ""
@@ -135,7 +150,7 @@ class Bridge(RigInterface):
 
     def _lose(self, why: str) -> None:
         if self._link.is_open:
-            self._counts["reconnects"] += 1
+            self._counts.reconnects += 1
         self._link.close()
         self._forget_board()
         if why != self._said:
@@ -167,8 +182,7 @@ class Bridge(RigInterface):
                     samples.clear()  # from before the reset, or not known yet whose they are
                     self._greet(message)
                 elif message.status != protocol.Status.OK:
-                    self._counts["commands refused by the board"] += 1
-            self._counts["bad frames"] = receiver.bad
+                    self._counts.commands_refused_by_the_board += 1
             if samples and self._hello is not None:
                 self._take(samples, arrival_ns)
 
@@ -192,7 +206,7 @@ class Bridge(RigInterface):
         if self._hello is None:
             self.get_logger().info(f"board at {self._link.port}: firmware {firmware}, build {hello.build:08x}")
         elif time.monotonic() - self._asked > ANSWER_S:
-            self._counts["board resets"] += 1
+            self._counts.board_resets += 1
             self.get_logger().warn(f"the board was reset ({hello.why_reset()}): duty 0 until the next command")
             self._forget_board()
         with self.lock:
@@ -216,11 +230,11 @@ class Bridge(RigInterface):
             if self._last is not None:
                 periods = round((board_ns - self._last_time) / (protocol.SAMPLE_TICKS * protocol.TICK_NS))
                 if periods <= 0 or (clock.settled and clock.early_ns(board_ns, arrival_ns) > CLOCK_STEP_NS):
-                    counts["board resets"] += 1  # and its HELLO was lost
+                    counts.board_resets += 1  # and its HELLO was lost
                     self.get_logger().warn("the board's clock started anew: duty 0 until the next command")
                     self._forget_board()
                     return
-                counts["lost samples"] += periods - 1
+                counts.lost_samples += periods - 1
             self._last, self._last_time = sample, board_ns
             self._note(sample)
             if sample is samples[-1]:
@@ -231,21 +245,21 @@ class Bridge(RigInterface):
 
     def _note(self, sample: Sample) -> None:
         flags, counts = sample.flags, self._counts
-        counts["samples without command"] += bool(flags & Flag.COMMAND_TIMEOUT)
-        counts["receive errors on the board"] += bool(flags & Flag.RECEIVE_ERROR)
-        counts["speed pulses rejected"] += bool(flags & Flag.PULSE_REJECTED)
-        counts["angles with errors"] += bool(flags & Flag.SSI and flags & (Flag.SSI_PARITY | Flag.SSI_STATUS))
+        counts.samples_without_command += bool(flags & Flag.COMMAND_TIMEOUT)
+        counts.receive_errors_on_the_board += bool(flags & Flag.RECEIVE_ERROR)
+        counts.speed_pulses_rejected += bool(flags & Flag.PULSE_REJECTED)
+        counts.angles_with_errors += bool(flags & Flag.SSI and flags & (Flag.SSI_PARITY | Flag.SSI_STATUS))
 
     def _publish(self, sample: Sample, stamp_ns: int) -> None:
         theta, omega, v_a, i_a, duty = self._calibration.measured(sample)
         gap = (stamp_ns - self._stamp) * 1e-9
         if self._stamp and gap > SILENCE_S:
-            self._counts["gaps"] += 1
+            self._counts.gaps += 1
             self._gap_max = max(self._gap_max, gap)
             self.get_logger().warn(f"no samples for {gap:.3f} s")
         self._stamp = stamp_ns
         self.publish_sample(stamp_ns, theta, omega, v_a, i_a, duty)
-        self._counts["samples"] += 1
+        self._counts.samples += 1
 
     # the executor's callbacks
 
@@ -258,9 +272,9 @@ class Bridge(RigInterface):
     def take_duty(self, duty: float) -> None:
         """Send a commanded duty to the board, if there is one and the node did not stand still before."""
         if self._hello is None:
-            self._counts["commands without board"] += 1
+            self._counts.commands_without_board += 1
         elif self._rests_after_stall():
-            self._counts["commands of a stall"] += 1
+            self._counts.commands_of_a_stall += 1
         elif self.enabled:
             self.duty = duty
             self._command()
@@ -273,7 +287,7 @@ class Bridge(RigInterface):
         now = time.monotonic()
         since = now - self._commanded
         if since > protocol.COMMAND_TIMEOUT_S and self.duty > 0.0:
-            self._counts["stalls"] += 1
+            self._counts.stalls += 1
             self.get_logger().warn(f"stood still for {since:.2f} s: duty 0 until the next command")
             self.duty = 0.0
             self._deaf_until = now + REPEAT_S
@@ -298,11 +312,14 @@ class Bridge(RigInterface):
             self._send_settings()
 
     def _report(self) -> tuple[str, dict[str, object]]:
-        self._counts["dropped writes"] = self._link.dropped
-        hello, lost = self._hello, self._counts["lost samples"]
+        hello, lost = self._hello, self._counts.lost_samples
         connected = hello is not None and time.monotonic() - self._heard < SILENCE_S
         values: dict[str, object] = {
-            **self._counts,
+            **{name.replace("_", " "): count for name, count in asdict(self._counts).items()},
+            "bad frames": self._receiver.bad,
+            "refused commands": self.refused,
+            "dropped writes": self._link.dropped,
+            "clock steps": self.clock_steps,
             "longest gap s": self._gap_max,
             "connected": connected,
             "enabled": self.enabled,
