@@ -9,7 +9,7 @@ import pytest
 from aeropend_sim.model import actuator
 from aeropend_sim.model.dynamics import simulate
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, load
-from aeropend_sim.studies import bench_fit
+from aeropend_sim.model.step_features import step_features
 
 # blocked rotor: v_a in V, i_a in A
 TABLE_4_1 = np.array([
@@ -109,7 +109,7 @@ def test_step_of_the_thesis_preset():
     model = load("thesis")
     n = 1500
     theta = simulate(model, np.full(n, 0.4314)).theta
-    found = bench_fit.step_features(np.arange(n) * SAMPLE_PERIOD, theta, float(theta[-1]))
+    found = step_features(np.arange(n) * SAMPLE_PERIOD, theta, float(theta[-1]))
     assert found.final == pytest.approx(0.264, abs=6e-4)
     assert found.peak_time == pytest.approx(0.40, abs=5e-3)
     assert found.rise_time == pytest.approx(0.18, abs=5e-3)

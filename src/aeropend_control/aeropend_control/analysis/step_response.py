@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aeropend_sim.studies.bench_fit import step_features
+from aeropend_sim.model.step_features import step_features
 
 Array = NDArray[np.float64]
 

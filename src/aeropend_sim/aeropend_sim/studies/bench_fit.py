@@ -29,6 +29,7 @@ from aeropend_sim.cli.command import EXIT_CODES, Parser, interruptible
 from aeropend_sim.model import actuator
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
 from aeropend_sim.model.rig import record
+from aeropend_sim.model.step_features import step_features
 
 Array = NDArray[np.float64]
 
@@ -40,16 +41,6 @@ DURATION = 8.0
 
 START = {"mgd_over_J": 29.8, "c_over_J": 2.3, "L_over_J": 87.6, "J_m": 1.0e-5}
 """Where the fit starts: 5.46 rad/s squared, and guesses."""
-
-
-class StepFeatures(NamedTuple):
-    """What describes a step response: its final value, times in s, and the overshoot as a share of the final value."""
-
-    final: float
-    rise_time: float
-    peak_time: float
-    settling_time: float
-    overshoot: float
 
 
 class Target(NamedTuple):
@@ -68,39 +59,6 @@ TARGETS = {
     "natural_frequency": Target(5.46, 0.05, "rad/s, sqrt(mgd/J); printed without its angle: 8 % lower at 0.54 rad"),
     "J_m": Target(1.0e-5, 0.69, "kg·m², a guess within a factor of 2"),
 }
-
-
-def step_features(time: Array, y: Array, final: float) -> StepFeatures:
-    """Features of a response that starts at 0.
-
-    Args:
-        time: (N,) s since the step. y: (N,) response. final: what it tends to, > 0.
-
-    Returns:
-        Rise time from 10 % to 90 % of the final value, time of the highest peak, and time after which the response
-        stays within 2 % of the final value; NaN for what the response does not reach within `time`.
-    """
-    def first_above(level: float) -> float:
-        k = int(np.argmax(y >= level))
-        if not y[k] >= level:
-            return math.nan
-        return float(np.interp(level, y[k - 1:k + 1], time[k - 1:k + 1])) if k else float(time[0])
-
-    outside = np.flatnonzero(np.abs(y - final) > 0.02 * final)
-    last = int(outside[-1]) if outside.size else -1
-    settled = math.nan
-    if last < 0:
-        settled = float(time[0])
-    elif last + 1 < len(y):
-        error = np.abs(y[last:last + 2] - final)
-        settled = float(np.interp(-0.02 * final, -error, time[last:last + 2]))
-    peak = int(np.argmax(y))
-    peak_time = float(time[peak])
-    if 0 < peak < len(y) - 1:  # between the samples, by a parabola
-        a, b, c = y[peak - 1:peak + 2]
-        peak_time += 0.5 * float((a - c) / (a - 2.0 * b + c)) * float(time[1] - time[0])
-    return StepFeatures(final, first_above(0.9 * final) - first_above(0.1 * final), peak_time, settled,
-                        float(y[peak]) / final - 1.0)
 
 
 def with_numbers(base: Model, numbers: Mapping[str, float]) -> Model:
