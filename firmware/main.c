@@ -281,7 +281,7 @@ static void rest(void) {
 static uint8_t on_duty(const uint8_t *payload) {
     uint16_t duty;
     memcpy(&duty, payload + 2, 2);
-    if (enabled && mode == MODE_DUTY)
+    if (enabled && mode == MODE_DIRECT)
         // rounds duty * TOP / 65535 without a division, which the compiler would move to where interrupts are off
         command_duty((uint8_t)(((uint32_t)duty * TOP + 32895) >> 16));
     return OK;
@@ -419,7 +419,7 @@ static void finish_sample(void) {
     if (enabled) {
         flags |= FLAG_ENABLED;
         if (command_age >= COMMAND_TIMEOUT)
-            flags |= FLAG_TIMEOUT;
+            flags |= FLAG_COMMAND_TIMEOUT;
     }
     if (mode == MODE_PID) {
         flags |= FLAG_PID;
@@ -430,7 +430,7 @@ static void finish_sample(void) {
                 if (command_age < COMMAND_TIMEOUT)
                     set_duty(duty);
             }
-            if (flags & FLAG_TIMEOUT)
+            if (flags & FLAG_COMMAND_TIMEOUT)
                 pid_reset(&pid);
         }
     }

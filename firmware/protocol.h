@@ -31,7 +31,7 @@ enum status { OK = 0, BAD_VALUE = 1, UNKNOWN_TYPE = 2, DISABLED = 3 };
 
 enum scheme { SCHEME_PWM = 0, SCHEME_SSI = 1 };
 
-enum mode { MODE_DUTY = 0, MODE_PID = 1 };
+enum mode { MODE_DIRECT = 0, MODE_PID = 1 };
 
 enum flag {
     FLAG_ENABLED = 1 << 0,
@@ -39,7 +39,7 @@ enum flag {
     FLAG_SSI_PARITY = 1 << 2,
     FLAG_SSI_STATUS = 1 << 3,
     FLAG_PULSE_REJECTED = 1 << 4,
-    FLAG_TIMEOUT = 1 << 5,
+    FLAG_COMMAND_TIMEOUT = 1 << 5,
     FLAG_PID = 1 << 6,
     FLAG_WATCHDOG_RESET = 1 << 7,
     FLAG_BROWN_OUT = 1 << 8,

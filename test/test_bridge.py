@@ -276,7 +276,7 @@ def test_a_firmware_of_another_version_is_refused(tmp_path):
         assert line.startswith("bridge: the board at ")
         assert "version 9" in line
         assert "make -C firmware flash" in line
-        assert set(board.commands) <= {Type.ASK_HELLO}
+        assert set(board.commands) <= {Type.HELLO_REQUEST}
     finally:
         bridge.stop()
         board.stop()

@@ -20,14 +20,15 @@ from emulated_board import _model as read_model
 from evaluation.support import boards
 from evaluation.support.boards import (
     ACK,
-    ASK_HELLO,
     BROWN_OUT_RESET,
     CHECKS,
+    COMMAND_TIMEOUT,
     DUTY,
     ENABLE,
     ENABLED,
     FIRMWARE,
     HELLO,
+    HELLO_REQUEST,
     MODE,
     NEW_PERIOD,
     PERIOD_TICKS,
@@ -39,7 +40,6 @@ from evaluation.support.boards import (
     SSI,
     SSI_PARITY,
     SSI_STATUS,
-    TIMEOUT,
     VOLTAGE_LSB,
     WRITE_CALIBRATION,
     Bench,
@@ -92,7 +92,7 @@ ALTERED = {
                                      boards.check_watchdog),
     "CRC not checked": ("protocol.c", "length > 2 && crc16(d->bytes, length - 2) ==", "length > 2 || length ==",
                         boards.check_bad_frames),
-    "duty while disabled": ("main.c", "if (enabled && mode == MODE_DUTY)", "if (mode == MODE_DUTY)",
+    "duty while disabled": ("main.c", "if (enabled && mode == MODE_DIRECT)", "if (mode == MODE_DIRECT)",
                             boards.check_disabled),
     "disabled with the duty it had": ("main.c", "if (!payload[1] || !enabled)", "if (payload[1] && !enabled)",
                                       boards.check_disabled),
@@ -112,7 +112,7 @@ def test_an_altered_program_does_not(name: str, tmp_path: Path) -> None:
 
 class TestCommands:
     def test_hello_tells_what_the_board_is(self, bench: Bench) -> None:
-        hello = bench.answer(ASK_HELLO)
+        hello = bench.answer(HELLO_REQUEST)
         assert len(hello) == 27
         assert hello[:5] == bytes([HELLO, 1, 1, 0, 0])
         assert hello[5] == 1  # power-on
@@ -133,7 +133,7 @@ class TestCommands:
             (PID_GAINS, "6f", (1, 1, 1, 0.01, 0, 1), OK), (PID_GAINS, "6f", (1, 1, 1, 0.01, 1, 0), BAD_VALUE),
             (PID_GAINS, "6f", (math.nan, 1, 1, 0.01, 0, 1), BAD_VALUE), (PID_GAINS, "5f", (1, 1, 1, 0, 0), BAD_VALUE),
             (PID_REFERENCE, "f", (1,), DISABLED), (PID_REFERENCE, "f", (math.inf,), BAD_VALUE),
-            (WRITE_CALIBRATION, "15B", range(15), BAD_VALUE), (ASK_HELLO, "B", (1,), BAD_VALUE),
+            (WRITE_CALIBRATION, "15B", range(15), BAD_VALUE), (HELLO_REQUEST, "B", (1,), BAD_VALUE),
             (0x18, "", (), UNKNOWN_TYPE), (0x00, "", (), UNKNOWN_TYPE), (0xFF, "4B", range(4), UNKNOWN_TYPE),
         ],
     )
@@ -163,7 +163,7 @@ class TestCommands:
         bench.chip.reset(EXTERNAL)
         bench.run(5)
         assert bench.host.read().answers[-1][7:23] == block
-        assert bench.answer(ASK_HELLO)[7:23] == block
+        assert bench.answer(HELLO_REQUEST)[7:23] == block
 
 
 class TestSamples:
@@ -312,7 +312,7 @@ class TestWithThePlant:
             if k % 500 == 0:
                 host.read()
             angles.append(board.truth.theta)
-        assert host.read().samples[-1].flags & (PID | ENABLED | TIMEOUT) == PID | ENABLED
+        assert host.read().samples[-1].flags & (PID | ENABLED | COMMAND_TIMEOUT) == PID | ENABLED
         assert np.mean(angles[-1000:]) == pytest.approx(80 * 2.0 * math.pi / 1024, abs=0.01)
         assert np.std(angles[-1000:]) < 0.02
 

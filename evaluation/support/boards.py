@@ -29,8 +29,8 @@ from board import GOOD_STATUS, PERIOD_CYCLES, TICK_CYCLES, Board, Chip, Pins  # 
 from aeropend_sim.model.parameters import Model, load  # noqa: E402
 
 SAMPLE, HELLO, ACK = 1, 2, 3
-DUTY, ASK_HELLO, ENABLE, SCHEME, PID_GAINS, PID_REFERENCE, MODE, WRITE_CALIBRATION = range(0x10, 0x18)
-(ENABLED, SSI, SSI_PARITY, SSI_STATUS, PULSE_REJECTED, TIMEOUT, PID, WATCHDOG, BROWN_OUT_RESET, RECEIVE_ERROR,
+DUTY, HELLO_REQUEST, ENABLE, SCHEME, PID_GAINS, PID_REFERENCE, MODE, WRITE_CALIBRATION = range(0x10, 0x18)
+(ENABLED, SSI, SSI_PARITY, SSI_STATUS, PULSE_REJECTED, COMMAND_TIMEOUT, PID, WATCHDOG, BROWN_OUT_RESET, RECEIVE_ERROR,
  NEW_PERIOD) = (1 << bit for bit in range(11))
 
 PERIOD_TICKS = PERIOD_CYCLES // TICK_CYCLES
@@ -373,7 +373,7 @@ def check_timeout(program: Path) -> None:
             bench.run(1)
             assert bench.chip.cycle - sent < 0.2 * 16e6
         assert 0.090 <= (bench.chip.cycle - sent) / 16e6 <= 0.100
-        assert bench.host.read().samples[-1].flags & TIMEOUT or bench.sample().flags & TIMEOUT
+        assert bench.host.read().samples[-1].flags & COMMAND_TIMEOUT or bench.sample().flags & COMMAND_TIMEOUT
 
 
 def check_receiver(program: Path) -> None:

@@ -158,7 +158,7 @@ class PtyBoard:
         for payload in filter(None, map(protocol.unframe, frames)):
             self.commands.append(payload[0])
             kind, value = payload[0], payload[1:]
-            if kind == Type.ASK_HELLO:
+            if kind == Type.HELLO_REQUEST:
                 self._hello()
                 continue
             if kind == Type.DUTY:

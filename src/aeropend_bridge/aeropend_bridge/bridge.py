@@ -188,7 +188,7 @@ class Bridge(RigInterface):
 
     def _ask(self) -> None:
         self._asked = time.monotonic()
-        self._link.write(protocol.ask_hello())
+        self._link.write(protocol.hello_request())
 
     def _greet(self, hello: Hello) -> None:
         if hello.version != protocol.VERSION:

@@ -133,7 +133,7 @@ class _Board:
         """Ask who it is."""
         end = time.monotonic() + PATIENCE_S
         while time.monotonic() < end:
-            self._link.write(protocol.ask_hello())
+            self._link.write(protocol.hello_request())
             for message in self._messages():
                 if isinstance(message, Hello):
                     if message.version != protocol.VERSION:

@@ -39,7 +39,7 @@ class Type(IntEnum):
     HELLO = 0x02
     ACK = 0x03
     DUTY = 0x10
-    ASK_HELLO = 0x11
+    HELLO_REQUEST = 0x11
     ENABLE = 0x12
     SCHEME = 0x13
     PID_GAINS = 0x14
@@ -228,9 +228,9 @@ def duty_command(sequence: int, duty: float) -> bytes:
     return frame(struct.pack("<BBH", Type.DUTY, sequence, round(duty * 65535)))
 
 
-def ask_hello() -> bytes:
+def hello_request() -> bytes:
     """Frame that asks the board for HELLO."""
-    return frame(bytes([Type.ASK_HELLO]))
+    return frame(bytes([Type.HELLO_REQUEST]))
 
 
 def enable(on: bool) -> bytes:

@@ -7,7 +7,7 @@ import tty
 import pytest
 
 from aeropend_bridge.link import Link, LinkError
-from aeropend_bridge.protocol import BAUD, Receiver, ask_hello, duty_command, unframe
+from aeropend_bridge.protocol import BAUD, Receiver, duty_command, hello_request, unframe
 
 
 class Pty:
@@ -68,7 +68,7 @@ def test_a_full_port_drops_what_is_written_and_never_waits(pty, link):
     assert link.dropped == 1
     assert not link.write(frame)
     taken = pty.read()
-    assert link.write(ask_hello())  # after a torn frame a zero comes first: this one is whole
+    assert link.write(hello_request())  # after a torn frame a zero comes first: this one is whole
     pieces = (taken + pty.read()).split(b"\0")
     assert unframe(pieces[-2]) == b"\x11"
     whole = sum(unframe(piece) == unframe(frame[:-1]) for piece in pieces)

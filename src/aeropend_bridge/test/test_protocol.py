@@ -50,7 +50,7 @@ def test_every_command_has_its_layout():
     def payload(command):
         return unframe(command[:-1])
 
-    assert payload(protocol.ask_hello()) == b"\x11"
+    assert payload(protocol.hello_request()) == b"\x11"
     assert payload(protocol.enable(True)) == b"\x12\x01"
     assert payload(protocol.enable(False)) == b"\x12\x00"
     assert payload(protocol.set_scheme(Scheme.SSI)) == b"\x13\x01"
