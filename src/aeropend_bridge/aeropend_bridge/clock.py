@@ -59,13 +59,15 @@ def line_below(points: list[Point]) -> tuple[float, float]:
     """Fit the line below all points that is closest to them in the mean.
 
     Args:
-        points: (x, y) by increasing x, at least one.
+        points: (x, y) by increasing x, at least one. A point whose x does not increase is ignored.
 
     Returns:
         Slope, within ±MAX_DRIFT, and the value at x = 0.
     """
     hull: list[Point] = []
     for x, y in points:
+        if hull and x <= hull[-1][0]:
+            continue
         while len(hull) > 1 and (hull[-1][1] - hull[-2][1]) * (x - hull[-1][0]) >= (y - hull[-1][1]) * (
             hull[-1][0] - hull[-2][0]
         ):

@@ -36,6 +36,7 @@ def test_what_the_converters_can_give_becomes_numbers(sample):
 @settled(100)
 @given(st.lists(st.tuples(st.integers(0, 2**32 - 1), st.integers(0, 10**9)), min_size=1, max_size=400))
 @example([(k * 2**31 % 2**32, 2_040_000) for k in range(400)])
+@example([(200_000, 0), (0, 0), (200_000, 0), (0, 0), (400_000, 0)])  # a clock that goes back, twice to one time
 def test_whatever_a_board_says_of_its_clock_stamps_rise(jumps):
     clock, arrival, stamps = BoardClock(TICK_NS), 10**18, []
     for ticks, later in jumps:
