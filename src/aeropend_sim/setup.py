@@ -9,7 +9,7 @@ setup(
     name=PACKAGE,
     version="0.1.0",
     packages=find_packages(exclude=["test", "test.*"]),
-    package_data={"aeropend_sim": ["config/*", "urdf/*.urdf", "layouts/*"]},
+    package_data={"aeropend_sim": ["config/*", "urdf/*.urdf", "layouts/*", "py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
