@@ -165,6 +165,6 @@ def test_a_point_that_is_never_done_is_a_miss():
 @pytest.mark.parametrize("effects", [(), growth.THREE])
 def test_a_narrowed_model_leaves_these_effects_to_consider_and_is_otherwise_nominal(tmp_path, effects):
     model = load(growth.narrowed(tmp_path / "model.yaml", effects))
-    assert {one.effect for one in hypotheses(model, numbers=False)} == set(effects)
+    assert {one.effect for one in hypotheses(model, mismatches=False)} == set(effects)
     assert model.model == load("bench").model
     assert model.sensing == load("bench").sensing

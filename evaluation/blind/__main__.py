@@ -25,7 +25,7 @@ from rich.progress import Progress
 from aeropend_ident.bags import recording
 from aeropend_ident.commands.diagnose import document
 from aeropend_ident.diagnosis.diagnosis import diagnose
-from aeropend_ident.signals.signals import from_recording
+from aeropend_ident.signals.from_bag import from_recording
 from aeropend_ident.testing import bags
 from aeropend_sim.model.parameters import load
 from evaluation.blind import cases, limit, peers, plant, report, uncalibrated

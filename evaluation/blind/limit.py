@@ -20,7 +20,7 @@ from scipy.optimize import lsq_linear
 from scipy.special import ndtr
 from threadpoolctl import threadpool_limits
 
-from aeropend_ident.diagnosis.chain.chain import mean_speed
+from aeropend_ident.signals.pulses import mean_speed
 from aeropend_sim.model import dynamics, sensing
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH, EffectParameter
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load

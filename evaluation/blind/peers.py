@@ -25,7 +25,7 @@ from scipy.signal import lfilter
 from threadpoolctl import threadpool_limits
 
 from aeropend_ident.diagnosis import free_run_gap
-from aeropend_ident.diagnosis.chain.chain import PLACE_OF_NUMBER
+from aeropend_ident.diagnosis.chain.values import PLACE_OF_PARAMETER
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import actuator
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
@@ -39,7 +39,7 @@ def place_of(key: str) -> str:
     """Where in the chain a hypothesis lives; "none" for none."""
     effect, _, number = key.partition(":")
     if effect == PARAMETER_MISMATCH:
-        return PLACE_OF_NUMBER[number]
+        return PLACE_OF_PARAMETER[number]
     return CATALOGUE[effect].place if effect in CATALOGUE else "none"
 
 
@@ -56,7 +56,7 @@ LIGHT, WIDE = 0.008, 0.035
 EVERY = 0.03
 """s between the rows of the regression."""
 
-NUMBER_SD = 0.03
+NOMINAL_SD = 0.03
 """Relative standard deviation that the model's numbers keep in the regression: that of ±5 % at random."""
 
 FAST = 80.0
@@ -250,7 +250,7 @@ def regression(lib: Library, signals: Signals) -> Regression:
             weight[e] = 1.0 / max(1.4826 * float(np.median(np.abs(rest))), 1e-12)
     numbers = np.array([stack(part) for part in lib.numbers.values()]).T
     # the inductance shows in derivatives only, which filtering spoils: it is left free
-    prior = np.diag([0.0 if name == "L_a" else 1.0 / NUMBER_SD for name in lib.numbers])
+    prior = np.diag([0.0 if name == "L_a" else 1.0 / NOMINAL_SD for name in lib.numbers])
     basis = np.linalg.qr(np.vstack([numbers, prior]))[0]
 
     def free(x: Array) -> Array:

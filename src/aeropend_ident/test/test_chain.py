@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aeropend_ident.diagnosis.chain.chain import BLOCKS, Chain, Chains
-from aeropend_ident.diagnosis.chain.priors import nominal_unknowns
+from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
+from aeropend_ident.diagnosis.chain.priors import nominal_parameters
+from aeropend_ident.diagnosis.chain.values import STAGES
 from aeropend_ident.estimation.map_fit import Search
 from aeropend_ident.testing.rigs import BENCH, recorded
 from aeropend_sim.model import actuator
@@ -17,13 +18,13 @@ from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
 @pytest.fixture(scope="module")
 def chains():
-    return Chains(BENCH, [recorded(seed, duration=8.0) for seed in range(3)])
+    return CutChains(BENCH, [recorded(seed, duration=8.0) for seed in range(3)])
 
 
-@pytest.mark.parametrize("block", BLOCKS)
-def test_the_training_part_alone_has_the_same_residuals(chains, block):
+@pytest.mark.parametrize("stage", STAGES)
+def test_the_training_part_alone_has_the_same_residuals(chains, stage):
     values = {"initial.theta": 0.1, "initial.theta@2": -0.1, "R_a": 1.2, "k1": 0.9 * BENCH.model["k1"]}
-    whole, head = (c.residuals(block)(values) for c in (chains, chains.head(10**6)))
+    whole, head = (c.residuals(stage)(values) for c in (chains, chains.head(10**6)))
     assert list(whole) == list(head)
     for channel, r in whole.items():
         np.testing.assert_array_equal(r, head[channel])
@@ -37,7 +38,7 @@ def test_a_head_is_as_long_as_asked_for(chains):
 @pytest.mark.parametrize("speed", [0.0, 120.0])
 def test_until_a_late_command_acts_the_voltage_is_what_the_rotor_begins_with(speed):
     signals = recorded(1, duration=8.0, without=("v_a", "i_a", "omega"))
-    chain = Chain.cut(BENCH, replace(signals, duty=np.full(len(signals), 0.3)))
+    chain = CutChain.cut(BENCH, replace(signals, duty=np.full(len(signals), 0.3)))
     v = chain.actuator({"command_delay.delay": 20 * SAMPLE_PERIOD, "initial.omega": speed})
     np.testing.assert_allclose(v[:20], actuator.voltage_at(BENCH.model, speed), atol=1e-9)
     np.testing.assert_allclose(v[20:], actuator.voltage(BENCH.model, 0.3), atol=1e-9)
@@ -48,7 +49,7 @@ def test_what_each_recording_has_its_own_of_costs_no_more_runs_with_more_recordi
 
     def slopes(several):
         residuals = several.residuals("arm")
-        search = Search(lambda values: runs.update(n=1) or residuals(values), nominal_unknowns(several, "arm"))
+        search = Search(lambda values: runs.update(n=1) or residuals(values), nominal_parameters(several, "arm"))
         runs.clear()
         search.jacobian()
         return runs["n"]
@@ -56,12 +57,12 @@ def test_what_each_recording_has_its_own_of_costs_no_more_runs_with_more_recordi
     assert slopes(chains) == slopes(chains.head(chains.each[0].signals.train))
 
 
-def test_slopes_are_those_of_all_residuals_by_all_unknowns(chains):
+def test_slopes_are_those_of_all_residuals_by_all_parameters(chains):
     residuals = chains.residuals("arm")
-    search = Search(residuals, nominal_unknowns(chains, "arm"))
+    search = Search(residuals, nominal_parameters(chains, "arm"))
     every = search.stacked(search.jacobian())
-    assert every.shape == (len(search.unknowns), sum(len(r) for r in search.current.values()))
-    for j in range(len(search.unknowns)):
+    assert every.shape == (len(search.parameters), sum(len(r) for r in search.current.values()))
+    for j in range(len(search.parameters)):
         z = search.z.copy()
         z[j] -= 1e-4 * (1.0 if z[j] + 1e-4 > search.high[j] else -1.0)
         slope = (search.stack(search.at(z)) - search.stack(search.current)) / (z[j] - search.z[j])

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from aeropend_ident.diagnosis.experiment_design import APART, LONGEST, advise, next_experiment
+from aeropend_ident.diagnosis.experiment_design import LONGEST, SEPARATE, advise, next_experiment
 from aeropend_ident.diagnosis.free_run_gap import free_run
 from aeropend_ident.signals.signals import Signals
 from aeropend_ident.testing.rigs import BENCH, recorded
@@ -90,7 +90,7 @@ def test_one_experiment_for_several_rivals(signals):
     assert advice["excite"]
     distances = [float(text.split()[0]) for text in advice["why"].split(" by ")[1:]]
     assert len(distances) == len(rivals)
-    assert min(distances) > APART
+    assert min(distances) > SEPARATE
 
 
 def test_a_rival_that_no_signal_rules_out_is_said_beside_the_experiment_for_the_others(signals):

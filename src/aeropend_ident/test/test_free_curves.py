@@ -4,9 +4,17 @@
 import numpy as np
 import pytest
 
-from aeropend_ident.diagnosis.chain.chain import BLOCKS, Chains
-from aeropend_ident.diagnosis.chain.priors import nominal_unknowns
-from aeropend_ident.diagnosis.search.free_curves import KNOTS, arm_response, hats, motor_response, shapes
+from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.priors import nominal_parameters
+from aeropend_ident.diagnosis.chain.values import STAGES
+from aeropend_ident.diagnosis.search.free_curves import (
+    KNOTS,
+    arm_response,
+    hats,
+    knots_of,
+    missing_terms,
+    motor_response,
+)
 from aeropend_ident.estimation.map_fit import fit
 from aeropend_ident.signals.signals import from_arrays
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
@@ -27,19 +35,19 @@ def recording(effects, read=lambda *_: None, seed=5, duration=20.0):
     return from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)
 
 
-def found(block, *recordings):
-    """The shapes in a part of the chain after the nominal structure was fitted to it and to those before."""
-    chains = Chains(BENCH, recordings)
-    for name in BLOCKS:
-        known = nominal_unknowns(chains, name)
+def found(stage, *recordings):
+    """The missing terms at the places of a stage after the nominal structure was fitted to it and to those before."""
+    chains = CutChains(BENCH, recordings)
+    for name in STAGES:
+        known = nominal_parameters(chains, name)
         base = fit(chains.residuals(name), known)
-        if name == block:
+        if name == stage:
             break
-        chains.feed_next(name, base.values)
-    return shapes(chains, block, base, known)
+        chains.set_next_input(name, base.values)
+    return missing_terms(chains, stage, base, known)
 
 
-@pytest.mark.parametrize(("place", "block", "effects", "read"), [
+@pytest.mark.parametrize(("place", "stage", "effects", "read"), [
     ("actuator", "actuator", {"bridge_drop": {}}, None),
     ("electrical", "motor", {"brush_drop": {"v_brush": 0.03}}, None),
     ("electrical", "motor", {"winding_heating": {}}, None),
@@ -49,8 +57,8 @@ def found(block, *recordings):
     ("thrust", "arm", {"thrust_exponent": {}}, None),
     ("thrust", "arm", {"thrust_lag": {}}, None),
     ("arm", "arm", {"quadratic_drag": {}}, None)])
-def test_a_term_is_found_where_it_acts(place, block, effects, read):
-    best, *others = found(block, recording(effects, read or (lambda *_: None)))
+def test_a_term_is_found_where_it_acts(place, stage, effects, read):
+    best, *others = found(stage, recording(effects, read or (lambda *_: None)))
     assert best.place == place
     assert best.before > 2.0
     assert best.left < 0.35 * best.before
@@ -64,9 +72,9 @@ def test_two_recordings_of_one_rig_agree_on_the_place():
 
 
 def test_nothing_missing_leaves_nothing_to_explain():
-    for block in BLOCKS:
-        for shape in found(block, recording({})):
-            assert 0.9 < shape.left <= shape.before < 1.5
+    for stage in STAGES:
+        for term in found(stage, recording({})):
+            assert 0.9 < term.left <= term.before < 1.5
 
 
 def along(curve, x):
@@ -75,12 +83,12 @@ def along(curve, x):
     return y - np.polyval(np.polyfit(x, y, 1), x)
 
 
-@pytest.mark.parametrize(("block", "effects", "variable", "range_", "truth"), [
+@pytest.mark.parametrize(("stage", "effects", "variable", "range_", "truth"), [
     ("actuator", {"supply_sag": {}}, "i_a", (-0.5, 0.9), None),
     ("arm", {"ground_effect": {}}, "theta (share of the thrust)", (0.03, 0.7), lambda x: 0.25 * np.exp(-x / 0.3)),
     ("motor", {}, "i_a", (-0.4, 0.8), lambda x: 0.02 * np.sin(6.0 * x))])
-def test_the_curve_is_the_terms_own(block, effects, variable, range_, truth):
-    best = found(block, recording(effects, bent_current if block == "motor" else lambda *_: None))[0]
+def test_the_curve_is_the_terms_own(stage, effects, variable, range_, truth):
+    best = found(stage, recording(effects, bent_current if stage == "motor" else lambda *_: None))[0]
     curve = next(c for c in best.curves if c.variable == variable)
     x = np.linspace(*range_, 200)
     if truth is None:  # linear: its slope counts
@@ -95,7 +103,8 @@ def test_the_curve_is_the_terms_own(block, effects, variable, range_, truth):
 def test_hats_draw_any_line_between_their_knots():
     x = np.random.default_rng(0).standard_normal(2000)
     x[::50] = np.nan
-    basis, knots = hats(x)
+    knots = knots_of(x)
+    basis = hats(x, knots)
     assert basis.shape == (2000, KNOTS)
     np.testing.assert_allclose(basis.sum(axis=1), 1.0)
     inside = (x > knots[0]) & (x < knots[-1])
@@ -105,7 +114,8 @@ def test_hats_draw_any_line_between_their_knots():
 
 @pytest.mark.parametrize("x", [np.zeros(50), np.full(50, np.nan)])
 def test_what_does_not_vary_carries_no_curve(x):
-    basis, knots = hats(x)
+    knots = knots_of(x)
+    basis = hats(x, knots)
     assert basis.shape == (50, 0)
     assert len(knots) == 0
 

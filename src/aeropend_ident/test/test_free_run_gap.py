@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from aeropend_ident.diagnosis.free_run_gap import closed, floor, free_run, gap
+from aeropend_ident.diagnosis.free_run_gap import closure, floor, free_run, gap
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, recorded
 
 
@@ -25,7 +25,7 @@ def test_share_of_what_can_close():
     effects = {"coulomb_friction": {}}
     before, floors = measured(BENCH, effects=effects)
     after, _ = measured(drawn_rig(21, effects), effects=effects)
-    share, low, high = closed(before, after, floors)
+    share, low, high = closure(before, after, floors)
     assert 0.97 < low <= share <= high <= 1.0
-    assert closed(before, before, floors)[0] == pytest.approx(0.0)
-    assert closed(after, after, floors) == (None, None, None)
+    assert closure(before, before, floors)[0] == pytest.approx(0.0)
+    assert closure(after, after, floors) == (None, None, None)

@@ -2,7 +2,9 @@
 import numpy as np
 import pytest
 
-from aeropend_ident.estimation.map_fit import Unknown, fit, independent_samples, screen
+from aeropend_ident.estimation.map_fit import fit, screen
+from aeropend_ident.estimation.parameter import Parameter
+from aeropend_ident.signals.statistics import effective_sample_size
 
 RNG = np.random.default_rng(7)
 T = np.linspace(0.0, 10.0, 2000)
@@ -17,18 +19,18 @@ def line(noise, slope=2.0, offset=0.5, bend=0.0):
     return residuals
 
 
-SLOPE = Unknown("slope", 2.1, 1.0)
-OFFSET = Unknown("offset", 0.0, 1.0)
-BEND = Unknown("bend", 0.0, 1.0)
+SLOPE = Parameter("slope", 2.1, 1.0)
+OFFSET = Parameter("offset", 0.0, 1.0)
+BEND = Parameter("bend", 0.0, 1.0)
 
 
 def test_white_noise_counts_in_full_and_coloured_noise_by_its_correlation_time():
     white = RNG.standard_normal(20_000)
-    assert independent_samples(white) == pytest.approx(20_000, rel=0.1)
+    assert effective_sample_size(white) == pytest.approx(20_000, rel=0.1)
     coloured = np.zeros(200_000)
     for k in range(1, len(coloured)):
         coloured[k] = 0.95 * coloured[k - 1] + RNG.standard_normal()
-    assert independent_samples(coloured) == pytest.approx(200_000 * 0.05 / 1.95, rel=0.2)
+    assert effective_sample_size(coloured) == pytest.approx(200_000 * 0.05 / 1.95, rel=0.2)
 
 
 def test_estimates_lie_within_their_intervals():
@@ -43,10 +45,10 @@ def test_estimates_lie_within_their_intervals():
 def test_the_right_structure_has_the_higher_evidence_and_the_wrong_one_does_not_run_to_absurd_numbers():
     noise = RNG.standard_normal(len(T))
     data = line(noise, bend=0.3)
-    known = Unknown("slope", 2.0, 0.1)
+    known = Parameter("slope", 2.0, 0.1)
     without, with_ = fit(data, [known, OFFSET]), fit(data, [known, OFFSET, BEND])
-    counts = with_.independent
-    assert with_.evidence(counts) - without.evidence(counts) > 100.0
+    ess = with_.ess
+    assert with_.log_evidence(ess) - without.log_evidence(ess) > 100.0
     assert with_.values["bend"] == pytest.approx(0.3, abs=3 * with_.sd["bend"])
     assert abs(without.values["slope"] - 2.0) < 0.3  # three prior standard deviations; the data alone would say 5
 
@@ -54,34 +56,34 @@ def test_the_right_structure_has_the_higher_evidence_and_the_wrong_one_does_not_
 def test_an_addition_that_explains_nothing_lowers_the_evidence():
     data = line(RNG.standard_normal(len(T)))
     without, with_ = fit(data, [SLOPE, OFFSET]), fit(data, [SLOPE, OFFSET, BEND])
-    assert with_.evidence(with_.independent) < without.evidence(with_.independent)
+    assert with_.log_evidence(with_.ess) < without.log_evidence(with_.ess)
 
 
 def test_two_hypotheses_that_fit_alike_have_the_same_evidence_wherever_their_searches_began():
     wave = np.sin(3.0 * T)
     y = 40.0 * wave + RNG.standard_normal(len(T))
-    fits = [fit(lambda values: {"y": y - values["size"] * wave}, [Unknown("size", 0.0, 1e4, start=start)], rounds=1)
+    fits = [fit(lambda values: {"y": y - values["size"] * wave}, [Parameter("size", 0.0, 1e4, start=start)], rounds=1)
             for start in (39.9, -300.0)]
-    assert fits[1].independent["y"] == pytest.approx(fits[0].independent["y"], rel=0.05)
-    found = [f.evidence(fits[0].independent) for f in fits]  # far away the residual was coloured, and counted for less
+    assert fits[1].ess["y"] == pytest.approx(fits[0].ess["y"], rel=0.05)
+    found = [f.log_evidence(fits[0].ess) for f in fits]  # far away the residual was coloured, and counted for less
     assert found[1] == pytest.approx(found[0], abs=0.01)
-    assert fits[0].simplicity({"y": 2000.0}) == pytest.approx(
+    assert fits[0].log_occam({"y": 2000.0}) == pytest.approx(
         -0.5 * (40.0 / 1e4) ** 2 - 0.5 * np.log(1.0 + 1e8 * np.sum(wave**2) / fits[0].scale["y"] ** 2), abs=0.05)
 
 
 def test_bounds_hold_and_logarithms_stay_positive():
     data = line(RNG.standard_normal(len(T)), slope=2.0)
-    found = fit(data, [Unknown("slope", 1.0, 0.5, 0.1, 1.5), OFFSET])
+    found = fit(data, [Parameter("slope", 1.0, 0.5, 0.1, 1.5), OFFSET])
     assert found.values["slope"] == pytest.approx(1.5)
-    found = fit(data, [Unknown("slope", 0.5, 1.0, 1e-3, 100.0, log=True), OFFSET])
+    found = fit(data, [Parameter("slope", 0.5, 1.0, 1e-3, 100.0, log=True), OFFSET])
     assert abs(found.values["slope"] - 2.0) < 3.0 * found.sd["slope"] < 0.1
 
 
 def test_screening_ranks_by_what_would_be_left():
     data = line(0.1 * RNG.standard_normal(len(T)), bend=0.3)
-    known = [Unknown("slope", 2.0, 0.1), OFFSET]
+    known = [Parameter("slope", 2.0, 0.1), OFFSET]
     base = fit(data, known)
-    useless = Unknown("nothing", 0.0, 1.0, start=1.0)
-    left = screen(data, base, known, [(Unknown("bend", 0.0, 1.0, start=0.1),), (useless,)])
+    useless = Parameter("nothing", 0.0, 1.0, start=1.0)
+    left = screen(data, base, known, [(Parameter("bend", 0.0, 1.0, start=0.1),), (useless,)])
     assert left[0] < 0.2
     assert left[1] == 1.0

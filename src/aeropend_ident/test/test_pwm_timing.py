@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from aeropend_ident.diagnosis.chain.chain import Chains
-from aeropend_ident.diagnosis.chain.pwm_timing import timed
+from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.pwm_timing import with_pwm_timing
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.testing.rigs import BENCH, recorded
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
@@ -38,13 +38,13 @@ def test_effects_are_found_beside_it(effect, parameters):
     {"current_offset": {}}, {"rotor_friction": {"torque": 3e-4}, "brush_drop": {}},
 ], ids=str)
 def test_other_recordings_keep_their_time(effects):
-    chains = Chains(BENCH, [recorded(4, effects)])
-    assert timed(chains) is chains
+    chains = CutChains(BENCH, [recorded(4, effects)])
+    assert with_pwm_timing(chains) is chains
 
 
 @pytest.mark.parametrize("number", ["L_a", "R_a", "K_e", "k1", "J_m"])
 @pytest.mark.parametrize("factor", [0.7, 1.4])
 def test_a_wrong_number_is_no_early_duty(number, factor):
     wrong = replace(BENCH, model={**BENCH.model, number: factor * BENCH.model[number]})
-    chains = Chains(wrong, [recorded(5, {}, off=0.0)])
-    assert timed(chains) is chains
+    chains = CutChains(wrong, [recorded(5, {}, off=0.0)])
+    assert with_pwm_timing(chains) is chains

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The search for an effect: where it starts, in which unknowns it is easy, and when it owns up to not knowing."""
+"""The search for an effect: where it starts, in which parameters it is linear, and when it owns up to not knowing."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from aeropend_ident.diagnosis.chain.chain import Chains
-from aeropend_ident.diagnosis.chain.priors import nominal_unknowns
+from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.diagnosis import diagnose
-from aeropend_ident.diagnosis.search.hypotheses import from_linear, linear_unknowns
-from aeropend_ident.diagnosis.search.search import _swap, refit, search
+from aeropend_ident.diagnosis.search.hypotheses import from_linear, linear_parameters
+from aeropend_ident.diagnosis.search.search import _with_better_rivals, refit, search
 from aeropend_ident.signals.signals import from_arrays
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import rig
@@ -32,14 +33,14 @@ def recording(effects, seed, duration=15.0, read=lambda *_: None):
 
 @pytest.mark.parametrize("periods", [0.4, 2.5, 9.1, 60.7])
 def test_the_voltage_places_a_delay_to_the_period(periods):
-    chain = Chains(BENCH, [recording({"command_delay": {"delay": periods * SAMPLE_PERIOD}}, 7, 10.0)]).each[0]
+    chain = CutChains(BENCH, [recording({"command_delay": {"delay": periods * SAMPLE_PERIOD}}, 7, 10.0)]).each[0]
     assert math.floor(chain.likeliest_delay({}) / SAMPLE_PERIOD) == math.floor(periods)
 
 
 @pytest.mark.parametrize("periods", [2.3, 9.8])
 def test_the_current_places_it_within_the_period(periods):
     """The voltage reads alike for every delay between two samples; how far the current has come does not."""
-    findings = search(Chains(BENCH, [recording({"command_delay": {"delay": periods * SAMPLE_PERIOD}}, 8)]), 2)
+    findings = search(CutChains(BENCH, [recording({"command_delay": {"delay": periods * SAMPLE_PERIOD}}, 8)]), 2)
     assert [h.name for h in findings["actuator"].effects] == ["command_delay"]
     motor = findings["motor"]
     assert motor.effects == []
@@ -51,20 +52,20 @@ def test_it_is_found_under_a_duty_that_changes_all_the_time():
     """Then what the voltage shows beyond its description without a delay is nothing of the voltage with one."""
     duty = 0.35 + 0.2 * np.sin(2.0 * np.pi * 1.5 * SAMPLE_PERIOD * np.arange(round(20.0 / SAMPLE_PERIOD)))
     columns, _ = rig.record(drawn_rig(4, {"command_delay": {"delay": 0.04}}), duty, 4)
-    findings = search(Chains(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)]), 2)
+    findings = search(CutChains(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)]), 2)
     assert [h.name for f in findings.values() for h in f.effects] == ["command_delay"]
     assert findings["motor"].final.values["command_delay.delay"] == pytest.approx(0.04, abs=1e-4)
 
 
-# --- unknowns in which an effect is linear
+# --- parameters in which an effect is linear
 
 
-def test_effects_that_are_linear_in_two_unknowns():
+def test_effects_that_are_linear_in_two_parameters():
     assert LINEAR == ["cable_torque", "encoder_eccentricity"]
 
 
 @pytest.mark.parametrize(("slope", "product"), [(4.0, 1.6), (0.3, -0.5), (60.0, 0.0)])
-def test_the_cable_is_the_same_spring_in_either_unknowns(slope, product):
+def test_the_cable_is_the_same_spring_in_either_parameters(slope, product):
     own = from_linear("cable_torque", {"cable_torque.slope": slope, "cable_torque.product": product, "R_a": 1.0})
     assert set(own) == {"cable_torque.k", "cable_torque.theta0", "R_a"}
     theta = np.linspace(-1.0, 1.0, 9)
@@ -79,7 +80,7 @@ def test_a_cable_without_stiffness_still_pulls():
 
 
 @pytest.mark.parametrize(("cosine", "sine"), [(0.06, 0.0), (0.0, 0.06), (-0.03, 0.04), (-0.02, -0.05)])
-def test_the_magnet_is_off_the_same_way_in_either_unknowns(cosine, sine):
+def test_the_magnet_is_off_the_same_way_in_either_parameters(cosine, sine):
     own = from_linear("encoder_eccentricity", {"encoder_eccentricity.cosine": cosine,
                                                "encoder_eccentricity.sine": sine})
     amplitude, phase = own["encoder_eccentricity.amplitude"], own["encoder_eccentricity.phase"]
@@ -92,8 +93,8 @@ def test_the_magnet_is_off_the_same_way_in_either_unknowns(cosine, sine):
 
 
 @pytest.mark.parametrize("id_", LINEAR)
-def test_both_linear_unknowns_are_zero_without_the_effect(id_):
-    values = {u.name: u.mean for u in linear_unknowns(id_)}
+def test_both_linear_parameters_are_zero_without_the_effect(id_):
+    values = {u.name: u.mean for u in linear_parameters(id_)}
     size = CATALOGUE[id_].parameters[CATALOGUE[id_].size]
     assert from_linear(id_, values)[f"{id_}.{CATALOGUE[id_].size}"] == pytest.approx(size.neutral, abs=1e-5)
 
@@ -103,7 +104,7 @@ def test_both_linear_unknowns_are_zero_without_the_effect(id_):
     ("encoder_eccentricity", {"amplitude": 0.05, "phase": -2.5}),
     ("encoder_eccentricity", {"amplitude": 0.05, "phase": 2.8})])
 def test_a_second_parameter_is_found_wherever_it_is(id_, true):
-    findings = search(Chains(BENCH, [recording({id_: true}, 9, 20.0)]), 2)["arm"]
+    findings = search(CutChains(BENCH, [recording({id_: true}, 9, 20.0)]), 2)["arm"]
     assert [h.name for h in findings.effects] == [id_]
     for name, value in true.items():
         full = f"{id_}.{name}"
@@ -114,13 +115,13 @@ def test_a_second_parameter_is_found_wherever_it_is(id_, true):
 
 
 def test_what_only_stood_in_for_an_effect_gives_way_to_it():
-    chains = Chains(BENCH, [recording({"coulomb_friction": {}, "cable_torque": {}}, 4, 20.0)])
+    chains = CutChains(BENCH, [recording({"coulomb_friction": {}, "cable_torque": {}}, 4, 20.0)])
     findings = search(chains, 2)["arm"]
     right, wrong, *others = findings.found[0]
     assert [right.hypothesis.name, findings.found[1][0].hypothesis.name] == ["coulomb_friction", "cable_torque"]
-    findings.found[0] = [wrong, right, *others]
-    findings.final = refit(chains, "arm", findings.effects, findings.final.values)
-    _swap(chains, findings, nominal_unknowns(chains, "arm"))
+    findings = replace(findings, found=((wrong, right, *others), *findings.found[1:]))
+    findings = replace(findings, final=refit(chains, "arm", findings.effects, findings.final.values))
+    findings = _with_better_rivals(chains, findings, nominal_parameters(chains, "arm"))
     assert [h.name for h in findings.effects] == ["coulomb_friction", "cable_torque"]
     assert findings.found[0][0].probability > 0.999
     assert [w.probability for w in findings.found[0][1:]] == pytest.approx([0.0] * (len(others) + 1), abs=1e-3)

@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 
 from aeropend_ident.bags.recording import RecordingError
-from aeropend_ident.signals.signals import find_pulses, from_arrays
+from aeropend_ident.signals.pulses import find_pulses
+from aeropend_ident.signals.signals import from_arrays
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, recorded, steps
 from aeropend_sim.model import rig
 from aeropend_sim.model.parameters import SAMPLE_PERIOD

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigs whose numbers nobody knows: what their recordings say of themselves, and what is found on top of it."""
+"""Uncalibrated rigs: noise, grid and nominal model come from the recordings, and effects are found on top."""
 
 import json
 import math
@@ -10,17 +10,20 @@ import pytest
 
 from aeropend_ident.bags.recording import Recording, RecordingError
 from aeropend_ident.commands.diagnose import main
-from aeropend_ident.diagnosis.chain.cached_chain import ThriftyChains
-from aeropend_ident.diagnosis.chain.chain import Chains
-from aeropend_ident.diagnosis.chain.nominal_fit import identify, with_effect
+from aeropend_ident.diagnosis import policy
+from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
+from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model, fit_with_effect
 from aeropend_ident.diagnosis.diagnosis import diagnose
-from aeropend_ident.diagnosis.experiment_design import within
-from aeropend_ident.diagnosis.search import search
+from aeropend_ident.diagnosis.experiment_design import experiments_within
 from aeropend_ident.diagnosis.search.hypotheses import hypotheses
-from aeropend_ident.diagnosis.validation import across
-from aeropend_ident.estimation.map_fit import independent_samples
+from aeropend_ident.diagnosis.validation import validate
+from aeropend_ident.signals.free_decay import free_swings
+from aeropend_ident.signals.from_bag import from_uncalibrated
+from aeropend_ident.signals.grid import irregular_grid
+from aeropend_ident.signals.noise import reading_noise_at, resolution, white_noise_at
 from aeropend_ident.signals.signals import Signals
-from aeropend_ident.signals.uncalibrated import free_swings, grid, noise, reading_sigma, resolution, signals_from
+from aeropend_ident.signals.statistics import effective_sample_size
 from aeropend_ident.testing import bags
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import dynamics, rig
@@ -76,19 +79,19 @@ def test_resolution_is_the_step_between_values():
 def test_noise_is_told_from_motion(rate):
     t = np.arange(0.0, 20.0, 1.0 / rate)
     x = np.sin(6.0 * t) + 0.003 * np.random.default_rng(1).standard_normal(len(t))
-    assert noise(t, x) == pytest.approx(0.003, rel=0.25)
-    assert reading_sigma(t, np.round(x / 0.1) * 0.1) == pytest.approx(0.1 / math.sqrt(12.0), rel=0.3)
+    assert white_noise_at(t, x) == pytest.approx(0.003, rel=0.25)
+    assert reading_noise_at(t, np.round(x / 0.1) * 0.1) == pytest.approx(0.1 / math.sqrt(12.0), rel=0.3)
 
 
 def test_the_grid_takes_steady_stamps_as_they_are_and_makes_a_finer_one_for_others():
     steady = np.rint(np.arange(400) * 2.0408e6).astype(np.int64)
-    index, period = grid(steady)
+    index, period = irregular_grid(steady)
     assert period == pytest.approx(2.0408e-3, rel=1e-5)
     assert np.array_equal(index, np.arange(400))
     bursts = np.cumsum(np.tile([5, 5, 5, 5, 5, 5, 5, 128], 30)) * 1_000_000
-    index, period = grid(bursts)
+    index, period = irregular_grid(bursts)
     assert np.abs(index * period - (bursts - bursts[0]) * 1e-9).max() < 0.6e-3
-    _, period = grid(np.arange(200) * 50_000_000, longest=5e-3)
+    _, period = irregular_grid(np.arange(200) * 50_000_000, longest=5e-3)
     assert 0.05 / period == pytest.approx(round(0.05 / period))
     assert period <= 5e-3
 
@@ -102,7 +105,7 @@ def test_a_push_begins_a_new_swinging():
 
 
 def test_a_viscous_swing_lacks_nothing_and_tells_its_numbers():
-    body = verdict(signals_from(recording(*let_go(9.0, zero=0.1)), BENCH.sensing))
+    body = verdict(from_uncalibrated(recording(*let_go(9.0, zero=0.1)), BENCH.sensing))
     assert (body["which"]["verdict"], body["which"]["effects"]) == ("none", [])
     numbers = body["which"]["numbers"]
     for name, true in (("mgd_over_J", 40.0), ("c_over_J", 0.4)):
@@ -118,7 +121,7 @@ def test_a_viscous_swing_lacks_nothing_and_tells_its_numbers():
 @pytest.mark.parametrize("seed", [1, 2])
 def test_what_brakes_a_swing_is_named_at_20_hz_and_one_degree(effect, parameters, seed):
     t, theta = let_go(6.0, {effect: parameters}, damping=0.05, seed=seed)
-    body = verdict(signals_from(recording(t, theta), BENCH.sensing))
+    body = verdict(from_uncalibrated(recording(t, theta), BENCH.sensing))
     assert body["which"]["verdict"] == effect
     (name, true), = parameters.items()
     found = candidate(body, effect)["parameters"][name]
@@ -130,7 +133,7 @@ def test_stamps_in_bursts_do():
     t, theta = let_go(8.0, {"coulomb_friction": {"accel": 1.0}}, rate=200.0, lsb=1e-3)
     kept = np.arange(len(t)) % 34 < 8
     shifted = t[kept] + 0.0023 * (np.arange(len(t)) // 34 % 2)[kept]
-    body = verdict(signals_from(recording(shifted, theta[kept]), BENCH.sensing))
+    body = verdict(from_uncalibrated(recording(shifted, theta[kept]), BENCH.sensing))
     assert body["which"]["verdict"] == "coulomb_friction"
 
 
@@ -139,14 +142,14 @@ def test_a_clock_that_wanders_is_no_effect(wander):
     t, theta = let_go(14.0, {"coulomb_friction": {"accel": 0.9}}, gravity=56.0, damping=0.13, first=1.3, rate=50.0,
                       lsb=1e-3)
     late = np.interp(t + wander * np.sin(2.0 * math.pi * t / 9.0), t, theta)
-    assert verdict(signals_from(recording(t, late), BENCH.sensing))["which"]["effects"] == ["coulomb_friction"]
+    assert verdict(from_uncalibrated(recording(t, late), BENCH.sensing))["which"]["effects"] == ["coulomb_friction"]
 
 
 def test_the_gap_on_another_recording_is_that_of_the_identified_model():
-    first, other = (signals_from(recording(*let_go(8.0, first=a, seed=k)), BENCH.sensing)
+    first, other = (from_uncalibrated(recording(*let_go(8.0, first=a, seed=k)), BENCH.sensing)
                     for k, a in enumerate((1.0, 0.7)))
     found = diagnose(BENCH, [first], 2, fit_nominal=True)
-    identified, guessed = (across(m, found.augmented, other) for m in (found.model, BENCH))
+    identified, guessed = (validate(m, found.augmented, other) for m in (found.model, BENCH))
     assert identified["gap"] < 1.5 * identified["floor"]
     assert guessed["gap"] > 5.0 * identified["gap"]
 
@@ -154,17 +157,17 @@ def test_the_gap_on_another_recording_is_that_of_the_identified_model():
 def test_a_narrow_band_is_worth_few_samples():
     rng = np.random.default_rng(0)
     white = rng.standard_normal(4000)
-    assert independent_samples(white, power=2) == pytest.approx(4000, rel=0.15)
+    assert effective_sample_size(white, power=2) == pytest.approx(4000, rel=0.15)
     ring = np.zeros(4000)
     for k in range(2, 4000):  # poles at 0.98: correlation 0.98^n cos(0.3 n), the sum of whose squares is 25
         ring[k] = 2.0 * 0.98 * math.cos(0.3) * ring[k - 1] - 0.98**2 * ring[k - 2] + white[k]
-    assert independent_samples(ring, power=2) == pytest.approx(4000 / 25, rel=0.4)
+    assert effective_sample_size(ring, power=2) == pytest.approx(4000 / 25, rel=0.4)
 
 
 def test_runs_that_differ_are_no_effect_and_their_spread_is_told():
     runs = [let_go(8.0, gravity=g, damping=c, first=a, seed=k)
             for k, (g, c, a) in enumerate([(40.0, 0.4, 1.0), (42.0, 0.5, 0.8), (39.0, 0.45, 1.2)])]
-    body = verdict(*(signals_from(recording(*run), BENCH.sensing) for run in runs))
+    body = verdict(*(from_uncalibrated(recording(*run), BENCH.sensing) for run in runs))
     assert body["which"]["effects"] == []
     gravity = body["which"]["numbers"]["mgd_over_J"]
     assert [r["value"] for r in gravity["runs"]] == pytest.approx([40.0, 42.0, 39.0], rel=0.01)
@@ -173,7 +176,7 @@ def test_runs_that_differ_are_no_effect_and_their_spread_is_told():
 
 def test_where_it_hangs_is_each_runs_own():
     runs = [let_go(8.0, first=1.0, zero=zero, seed=k) for k, zero in enumerate((0.0, 0.1, -0.05))]
-    body = verdict(*(signals_from(recording(*run), BENCH.sensing) for run in runs))
+    body = verdict(*(from_uncalibrated(recording(*run), BENCH.sensing) for run in runs))
     assert body["which"]["effects"] == []
     hangs = body["identified"]["hangs_at"]
     assert [r["value"] for r in hangs["runs"]] == pytest.approx([0.0, 0.1, -0.05], abs=0.005)
@@ -184,9 +187,9 @@ def test_an_arm_that_thrust_holds_cannot_be_diagnosed_without_the_command():
     parts = [let_go(4.0, first=a, held=0.2, damping=1.5)[1] for a in (0.6, 0.7, 0.5)]
     theta = np.concatenate(parts) + math.radians(100.0)
     with pytest.raises(RecordingError, match=r"pushed \d times and comes to rest at 100 degrees.*without the command"):
-        signals_from(recording(np.arange(len(theta)) / 20.0, theta), BENCH.sensing)
+        from_uncalibrated(recording(np.arange(len(theta)) / 20.0, theta), BENCH.sensing)
     with pytest.raises(RecordingError, match="does not swing down freely"):
-        signals_from(recording(np.arange(400) / 20.0, np.repeat([0.0, 0.4, 0.2, 0.5], 100)), BENCH.sensing)
+        from_uncalibrated(recording(np.arange(400) / 20.0, np.repeat([0.0, 0.4, 0.2, 0.5], 100)), BENCH.sensing)
 
 
 def unknown(seed, effects=None, duration=30.0, factor=0.5, lever=1.0, **kept):
@@ -204,12 +207,12 @@ def unknown(seed, effects=None, duration=30.0, factor=0.5, lever=1.0, **kept):
 
 def test_the_lever_is_each_runs_own():
     read = [unknown(4, duration=15.0, lever=lever)[1] for lever in (1.0, 1.2, 0.9)]
-    assert verdict(*(signals_from(r, BENCH.sensing) for r in read))["which"]["verdict"] == "none"
+    assert verdict(*(from_uncalibrated(r, BENCH.sensing) for r in read))["which"]["verdict"] == "none"
 
 
-def test_angle_and_command_alone_name_an_effect_in_a_rig_that_nobody_knows():
+def test_angle_and_command_alone_name_an_effect_in_an_uncalibrated_rig():
     model, read = unknown(3, {"coulomb_friction": {"accel": 0.8}})
-    body = verdict(signals_from(read, BENCH.sensing))
+    body = verdict(from_uncalibrated(read, BENCH.sensing))
     assert body["which"]["verdict"] == "coulomb_friction"
     accel = candidate(body, "coulomb_friction")["parameters"]["accel"]
     assert accel["value"] == pytest.approx(0.8, rel=0.15)
@@ -222,44 +225,44 @@ def test_angle_and_command_alone_name_an_effect_in_a_rig_that_nobody_knows():
     ("thrust_exponent", "n", 1.3), ("thrust_lag", "tau", 0.25), ("command_delay", "delay", 0.12)])
 def test_an_effect_of_the_drive_is_identified_together_with_the_numbers(effect, parameter, size):
     model, read = unknown(4, {effect: {parameter: size}}, duration=25.0)
-    signals = signals_from(read, BENCH.sensing)
-    misled, _ = identify(BENCH, [signals])
-    (unknown_,) = next(h.starts[0] for h in hypotheses(BENCH) if h.effect == effect)
-    found = with_effect(misled, [signals], unknown_)
+    signals = from_uncalibrated(read, BENCH.sensing)
+    misled, _ = fit_nominal_model(BENCH, [signals])
+    (size,) = next(h.own for h in hypotheses(BENCH) if h.effect == effect)
+    found = fit_with_effect(misled, [signals], size)
     assert found[unknown_.name] == pytest.approx(size, rel=0.25)
     assert found["mgd_over_J"] == pytest.approx(model.model["mgd_over_J"], rel=0.05)
 
 
 def test_chance_is_not_taken_for_what_it_looks_like():
     _, read = unknown(8, {"gust": {"sigma": 0.05, "tau": 0.3}}, duration=60.0)
-    assert verdict(signals_from(read, BENCH.sensing))["which"]["effects"] == ["gust"]
+    assert verdict(from_uncalibrated(read, BENCH.sensing))["which"]["effects"] == ["gust"]
 
 
 def test_what_a_misled_model_leaves_is_not_taken_for_chance():
     """An arm that turns over and over: the search for its numbers ends elsewhere, and no effect is to blame."""
     _, read = unknown(7)
     assert np.ptp(read.theta) > 8.0 * math.pi
-    assert verdict(signals_from(read, BENCH.sensing))["which"]["effects"] == []
+    assert verdict(from_uncalibrated(read, BENCH.sensing))["which"]["effects"] == []
 
 
 def test_thrifty_chains_give_what_others_give_and_count():
     _, read = unknown(5, duration=6.0)
-    signals = signals_from(read, BENCH.sensing)
-    plain, thrifty = Chains(BENCH, [signals], fit_nominal=True), ThriftyChains(BENCH, [signals])
+    signals = from_uncalibrated(read, BENCH.sensing)
+    plain, cached = CutChains(BENCH, [signals], policy.UNCALIBRATED), CachedChains(BENCH, [signals])
     flex = {"mast_flex.coupling": 0.3, "mast_flex.omega": 90.0, "mast_flex.zeta": 0.05}
     tried = [{}, {"mgd_over_J": 50.0}, {"J_m": 5e-5}, {}, {"mgd_over_J": 50.0, "J_m": 5e-5}, {"initial.omega": 40.0},
              flex, {"command_delay.delay": 0.03}, {"brush_drop.v_brush": 0.2}, {"sensing.angle_filter_tau": 0.01},
              {"mgd_over_J": 1e4}, {}]
     for values in tried:
         expected = plain.residuals("arm")(values)["theta"]
-        np.testing.assert_allclose(thrifty.residuals("arm")(values)["theta"], expected, rtol=0.0, atol=1e-6)
-    assert thrifty.runs == len(tried)
+        np.testing.assert_allclose(cached.residuals("arm")(values)["theta"], expected, rtol=0.0, atol=1e-6)
+    assert cached.runs == len(tried)
 
 
 def test_a_search_that_is_cut_short_says_so(monkeypatch):
     _, read = unknown(3, {"coulomb_friction": {"accel": 0.8}}, duration=20.0)
-    signals = signals_from(read, BENCH.sensing)
-    monkeypatch.setattr(search, "MOST_RUNS", 1)
+    signals = from_uncalibrated(read, BENCH.sensing)
+    monkeypatch.setattr(policy, "UNCALIBRATED", replace(policy.UNCALIBRATED, budget=1))
     result = diagnose(BENCH, [signals], 2, fit_nominal=True)
     assert any("cut short" in note for note in result.signals[0].notes)
     json.dumps(result.body, allow_nan=False)
@@ -269,24 +272,24 @@ def test_a_search_that_is_cut_short_says_so(monkeypatch):
                                               ("command_delay", {"delay": 0.004})])
 def test_what_the_nominal_model_can_take_is_not_claimed(effect, size):
     _, read = unknown(4, {effect: size}, duration=20.0)
-    assert verdict(signals_from(read, BENCH.sensing))["which"]["effects"] == []
+    assert verdict(from_uncalibrated(read, BENCH.sensing))["which"]["effects"] == []
 
 
 def test_the_experiment_advised_asks_for_no_more_duty_than_there_was():
     _, read = unknown(6, {"cable_torque": {}})
-    advised = verdict(signals_from(read, BENCH.sensing))["which"]["next_experiment"]["excite"]
+    advised = verdict(from_uncalibrated(read, BENCH.sensing))["which"]["next_experiment"]["excite"]
     assert 0.0 < Excitation(**advised).series().max() <= np.max(read.duty)
 
 
 @pytest.mark.parametrize("top", [0.003, 0.264, 1.0])
 def test_an_experiment_drives_an_unknown_rig_no_harder_than_it_was_driven(top):
-    for experiment in within(top):
+    for experiment in experiments_within(top):
         assert 0.0 < experiment.series().max() <= max(top, 0.02)
 
 
-def test_all_channels_give_the_numbers_of_a_rig_that_nobody_knows():
+def test_all_channels_give_the_numbers_of_an_uncalibrated_rig():
     model, read = unknown(4, omega=True, i_a=True, v_a=True)
-    body = verdict(signals_from(read, BENCH.sensing))
+    body = verdict(from_uncalibrated(read, BENCH.sensing))
     assert body["which"]["effects"] == []
     for name in ("R_a", "L_a", "K_e", "mgd_over_J", "c_over_J"):
         row = body["which"]["numbers"][name]
@@ -298,7 +301,7 @@ def test_all_channels_give_the_numbers_of_a_rig_that_nobody_knows():
 @pytest.mark.parametrize("effect", ["brush_drop", "coulomb_friction"])
 def test_all_channels_show_effects_on_top(effect):
     _, read = unknown(4, {effect: {}}, duration=20.0, omega=True, i_a=True, v_a=True)
-    assert verdict(signals_from(read, BENCH.sensing))["which"]["effects"] == [effect]
+    assert verdict(from_uncalibrated(read, BENCH.sensing))["which"]["effects"] == [effect]
 
 
 def bag(path, t, theta):

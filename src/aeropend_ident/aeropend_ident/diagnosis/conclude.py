@@ -1,69 +1,89 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `diagnosis.json` tells of a diagnosis: numbers, candidates, close pairs and the next experiment."""
+"""The conclusions of a diagnosis as rows of `diagnosis.json`: parameters, candidates, close pairs, next experiment."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from aeropend_ident.diagnosis import experiment_design
 from aeropend_ident.diagnosis.chain import nominal_fit
-from aeropend_ident.diagnosis.chain.chain import BLOCKS, Chains, of_recording, with_values
-from aeropend_ident.diagnosis.chain.priors import ARM, GUESS_SD, ZERO, angle_only, basis, number_unknowns
-from aeropend_ident.diagnosis.free_run_gap import Scorer
-from aeropend_ident.diagnosis.joint_fit import Z95, neutral
-from aeropend_ident.diagnosis.search.search import Findings
-from aeropend_ident.diagnosis.search.selection import Weighed
-from aeropend_ident.estimation.map_fit import Unknown
+from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.priors import OF_THE_ARM, UNCALIBRATED_SD, ZERO, basis, model_parameters
+from aeropend_ident.diagnosis.chain.values import STAGES, neutral, of_rig, with_values
+from aeropend_ident.diagnosis.free_run_gap import HeldOut
+from aeropend_ident.diagnosis.joint_fit import Z95, JointFit
+from aeropend_ident.diagnosis.policy import CALIBRATED, angle_only
+from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis
+from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import MODEL_NAMES, PARAMETERS, Model
 
 DETERMINED = 0.5
-"""Share of a prior's width from which on the data have not fixed a number."""
+"""Share of a prior's width above which the recordings have not determined a parameter (choice)."""
 
-UNDECIDED = 0.05
-"""Probability from which on a rival is not ruled out."""
-
-UNDECIDED_UNKNOWN = 0.01
-"""As `UNDECIDED`, of a rival in a rig whose numbers nobody knows: they may stand in for more of an effect."""
+TRACE = 1e-3
+"""Probability below which the gap of a candidate is not computed: it would change nothing."""
 
 
-def numbers(chains: Chains, values: Mapping[str, float], sd: Mapping[str, float]) -> dict[str, dict[str, object]]:
-    """The model's numbers that were refitted; of an unknown rig all, with what the recordings cannot fix marked so."""
-    nominal = chains.model.model
-    if not chains.fit_nominal:
+@dataclass(frozen=True)
+class Statistical:
+    """Effects that were detected by their statistics, not fitted.
+
+    Attributes:
+        gust: a random torque on the arm.
+        spikes: false captures of the speed.
+    """
+
+    gust: RankedHypothesis | None
+    spikes: RankedHypothesis | None
+
+    @property
+    def found(self) -> list[RankedHypothesis]:
+        """Those that were detected."""
+        return [e for e in (self.gust, self.spikes) if e is not None]
+
+
+def parameter_rows(chains: CutChains, joint: JointFit) -> dict[str, dict[str, object]]:
+    """The parameters of the model that were refitted.
+
+    For an uncalibrated rig all of them, marked by whether the recordings determine them.
+    """
+    nominal, values, sd = chains.model.model, joint.values, joint.sd
+    if chains.policy.calibrated:
         return {n: {"nominal": nominal[n], **_interval(values[n], sd[n])} for n in MODEL_NAMES if n in values}
-    fitted = {u.name: u for block in BLOCKS for u in number_unknowns(chains, block)}
+    fitted = {p.name: p for stage in STAGES for p in model_parameters(chains, stage)}
     alone = angle_only(chains.recordings)
     rows: dict[str, dict[str, object]] = {}
     for n in MODEL_NAMES:
-        p = PARAMETERS[f"model.{n}"]
-        u = fitted.get(n, Unknown(n, nominal[n], GUESS_SD, p.low, p.high, log=nominal[n] > 0.0))
-        # of a curve from duty to lift that only acts as a whole no single number is known
-        known = n in fitted and (n in ARM or not alone)
+        limits = PARAMETERS[f"model.{n}"]
+        p = fitted.get(n, Parameter(n, nominal[n], UNCALIBRATED_SD, limits.low, limits.high, log=nominal[n] > 0.0))
+        # with the angle alone, only the curve from duty to lift is identifiable, not its parameters
+        known = n in fitted and (n in OF_THE_ARM or not alone)
         value = values.get(n, nominal[n])
-        spread = sd[n] if known else GUESS_SD * abs(value)
-        prior = u.sd * (value if u.log else 1.0)
-        if u.log and value > 0.0:
+        spread = sd[n] if known else UNCALIBRATED_SD * abs(value)
+        prior = p.sd * (value if p.log else 1.0)
+        if p.log and value > 0.0:
             reach = math.exp(Z95 * spread / value)
-            between = {"value": value, "low": max(value / reach, p.low), "high": min(value * reach, p.high)}
+            between = {"value": value, "low": max(value / reach, limits.low), "high": min(value * reach, limits.high)}
         else:
-            between = _interval(value, spread, u.low, u.high)
+            between = _interval(value, spread, p.low, p.high)
         rows[n] = {"nominal": nominal[n], **between, "determined": known and spread < DETERMINED * prior}
         if known:
-            rows[n] |= _over_runs(n, values, sd)
+            rows[n] |= _over_recordings(n, values, sd)
     return rows
 
 
-def _over_runs(name: str, of_all: Mapping[str, float], sd_of_all: Mapping[str, float]) -> dict[str, object]:
-    """A number, if each run has its own: mean, values, and how much more they scatter than they are unsure."""
-    runs = sorted((n for n in of_all if of_recording(n)[0] == name), key=lambda n: of_recording(n)[1])
-    if len(runs) < 2:
+def _over_recordings(name: str, of_all: Mapping[str, float], sd_of_all: Mapping[str, float]) -> dict[str, object]:
+    """A value that each recording has of its own: mean, values, and their scatter beyond their uncertainty."""
+    own = sorted((n for n in of_all if key(n).plain == name), key=lambda n: key(n).recording)
+    if len(own) < 2:
         return {}
-    values, sd = [of_all[r] for r in runs], [sd_of_all[r] for r in runs]
+    values, sd = [of_all[n] for n in own], [sd_of_all[n] for n in own]
     spread = math.sqrt(max(float(np.var(values, ddof=1)) - float(np.mean(np.square(sd))), 0.0))
     mean, unsure = float(np.mean(values)), math.sqrt(float(np.var(values, ddof=1)) / len(values))
     unsure = max(unsure, math.sqrt(float(np.sum(np.square(sd)))) / len(sd))
@@ -71,78 +91,103 @@ def _over_runs(name: str, of_all: Mapping[str, float], sd_of_all: Mapping[str, f
             "run_to_run": spread}
 
 
-def identified_model(chains: Chains, values: Mapping[str, float], sd: Mapping[str, float],
-                     rows: Mapping[str, Mapping[str, object]]) -> dict[str, object]:
-    """What the nominal model of an unknown rig was identified from, and what of it (`rows`: `numbers`) stays open."""
-    recordings = chains.recordings
+def identified_model(chains: CutChains, joint: JointFit, rows: Mapping[str, Mapping[str, object]]
+                     ) -> dict[str, object]:
+    """What the nominal model of an uncalibrated rig was identified from.
+
+    Args:
+        chains: cut.
+        joint: the joint fit.
+        rows: of `parameter_rows`.
+    """
+    recordings, values = chains.recordings, joint.values
     said: dict[str, object] = {"from": basis(recordings),
                                "not_determined": [n for n, row in rows.items() if not row["determined"]]}
     if "k3" in values and angle_only(recordings):
-        said["lift"] = nominal_fit.lift(with_values(chains.model, chains.own(values, 0)), recordings)
+        said["lift"] = nominal_fit.lift(with_values(chains.model, chains.values_of(values, 0)), recordings)
     if ZERO in values:
-        said["hangs_at"] = _interval(values[ZERO], sd[ZERO]) | _over_runs(ZERO, values, sd)
+        said["hangs_at"] = _interval(values[ZERO], joint.sd[ZERO]) | _over_recordings(ZERO, values, joint.sd)
     return said
 
 
-def candidates(findings: Mapping[str, Findings], values: Mapping[str, float], sd: Mapping[str, float],
-               torque: Weighed | None, spikes: Weighed | None, scorer: Scorer, gap_after: float
-               ) -> list[dict[str, object]]:
-    """Every hypothesis that was weighed, the most probable first; a found one with its intervals of the joint fit."""
-    rows: dict[str, dict[str, object]] = {}
+def candidates(findings: Mapping[str, Findings], joint: JointFit, statistical: Statistical, held_out: HeldOut,
+               gap_after: float) -> list[dict[str, object]]:
+    """Every hypothesis that was ranked, the most probable first; a found one with its intervals of the joint fit.
+
+    Args:
+        findings: stage -> what is claimed, with all selections.
+        joint: the joint fit.
+        statistical: effects that were detected by their statistics.
+        held_out: measures gaps.
+        gap_after: gap of the augmented model.
+    """
+    rows: dict[str, tuple[float, dict[str, object]]] = {}
     for f in findings.values():
         accepted = {h.name for h in f.effects}
-        for round_ in [*f.found, f.rivals]:
-            for w in round_:
-                h = w.hypothesis
+        for selection in f.selections:
+            for r in selection:
+                h = r.hypothesis
                 mine = h.name in accepted
-                if h.name in rows and (rows[h.name]["probability"] >= w.probability or mine):  # type: ignore[operator]
+                if h.name in rows and (rows[h.name][0] >= r.probability or mine):
                     continue
-                if mine and w is not round_[0]:
+                if mine and r is not selection[0]:
                     continue
-                source, spread = (values, sd) if mine else (w.fit.values, w.fit.sd)
-                whole = {**values, **w.fit.values}
-                rows[h.name] = {
-                    "effect": h.effect, "place": h.place, "probability": w.probability,
-                    "parameters": {u.name.rpartition(".")[2]:
-                                   _interval(source[u.name], spread[u.name], u.low, u.high) for u in h.starts[0]},
+                source, spread = (joint.values, joint.sd) if mine else (r.fit.values, r.fit.sd)
+                whole = {**joint.values, **r.fit.values}
+                rows[h.name] = r.probability, {
+                    "effect": h.effect, "place": h.place, "probability": r.probability,
+                    "parameters": {key(p.name).name: _interval(source[p.name], spread[p.name], p.low, p.high)
+                                   for p in h.own},
                     "found": mine,
-                    "gap_after": gap_after if mine else scorer.of(whole).total if w.probability > 1e-3 else None}
-    for extra in (torque, spikes):
-        if extra is not None:
-            rows[extra.hypothesis.name] = {
-                "effect": extra.hypothesis.effect, "place": extra.hypothesis.place, "probability": extra.probability,
-                "parameters": {n.partition(".")[2]: _interval(v, extra.fit.sd[n], 0.0)
-                               for n, v in extra.fit.values.items()},
-                "found": True, "gap_after": gap_after}
-    return sorted(rows.values(), key=lambda row: -row["probability"])  # type: ignore[operator]
+                    "gap_after": (gap_after if mine else
+                                  held_out.gap_of(whole).total if r.probability > TRACE else None)}
+    for extra in statistical.found:
+        rows[extra.hypothesis.name] = extra.probability, {
+            "effect": extra.hypothesis.effect, "place": extra.hypothesis.place, "probability": extra.probability,
+            "parameters": {key(n).name: _interval(v, extra.fit.sd[n], 0.0) for n, v in extra.fit.values.items()},
+            "found": True, "gap_after": gap_after}
+    return [row for _, row in sorted(rows.values(), key=lambda item: -item[0])]
 
 
-def not_separable(findings: Mapping[str, Findings], least: float = UNDECIDED) -> list[tuple[Weighed, Weighed]]:
-    """Pairs that this recording cannot tell apart: the first of a round and rivals of `least` probability."""
-    return [(round_[0], w) for f in findings.values() for round_ in [*f.found, f.rivals]
-            if round_ and round_[0].probability > UNDECIDED for w in round_[1:]
-            if w.probability > least]
+def not_separable(findings: Mapping[str, Findings], least: float) -> list[tuple[RankedHypothesis, RankedHypothesis]]:
+    """Pairs that the recordings cannot separate: the first of a selection, and its probable rivals.
+
+    Args:
+        findings: stage -> what is claimed.
+        least: probability above which a rival is not ruled out.
+    """
+    return [(selection[0], r) for f in findings.values() for selection in f.selections
+            if selection and selection[0].probability > CALIBRATED.undecided for r in selection[1:]
+            if r.probability > least]
 
 
-def names(first: Weighed, second: Weighed) -> tuple[str, str]:
-    """What two rivals are called: their effects, or, of two numbers that may be off, `parameter_mismatch:NUMBER`."""
+def names(first: RankedHypothesis, second: RankedHypothesis) -> tuple[str, str]:
+    """The names of two rivals: their effects; of two parameters that may be far off `parameter_mismatch:PARAMETER`."""
     a, b = first.hypothesis, second.hypothesis
     return (a.effect, b.effect) if a.effect != b.effect else (a.name, b.name)
 
 
-def next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[Weighed, Weighed]],
+def next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[RankedHypothesis, RankedHypothesis]],
                     values: Mapping[str, float], tried: Sequence[Excitation]) -> dict[str, object] | None:
-    """The experiment that would tell the closest pair apart; None where nothing is open."""
+    """The experiment that would separate the closest pair; None where nothing is open.
+
+    Args:
+        model: the nominal model.
+        signals: a recording.
+        pairs: see `not_separable`.
+        values: of the joint fit.
+        tried: the signals that are tried.
+    """
     if not pairs:
         return None
     if not signals.driven:
-        return {"why": "let the arm go from higher and record until it rests: what brakes it shows in how its swings "
-                       "shrink; drive it and record the command as well to tell more", "excite": {}}
+        return {"why": "release the arm from a larger angle and record until it rests: the decay of the swings shows "
+                       "the kind of friction; drive the arm and record the command as well to see more", "excite": {}}
     first, second = max(pairs, key=lambda pair: pair[1].probability)
-    own = {u.name: neutral(model, u.name) for w in (first, second) for u in w.hypothesis.starts[0]}
-    one, other = ({**values, **own, **w.fit.values} for w in (first, second))
-    if any("@" in n for n in values):
-        one, other = nominal_fit.shared(one), nominal_fit.shared(other)
+    own = {p.name: neutral(model, p.name) for r in (first, second) for p in r.hypothesis.own}
+    one, other = ({**values, **own, **r.fit.values} for r in (first, second))
+    if any(key(n).recording for n in values):
+        one, other = of_rig(one), of_rig(other)
     return experiment_design.next_experiment(model, signals, one, other, names(first, second), tried)
 
 

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole diagnosis of one rig: gap, place, effects, numbers, and how far the gap closes."""
+"""The diagnosis of one rig, step by step; docs/method.md explains the steps.
+
+identify the nominal model (uncalibrated rigs) -> cut the chain -> search effects -> detect gust and false captures ->
+judge whether an effect is unknown -> fit all jointly -> measure the gap -> conclude.
+"""
 
 from __future__ import annotations
 
@@ -10,34 +14,44 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from aeropend_ident.diagnosis import conclude, free_run_gap, joint_fit, regions
-from aeropend_ident.diagnosis.chain import nominal_fit
-from aeropend_ident.diagnosis.chain.cached_chain import ThriftyChains
-from aeropend_ident.diagnosis.chain.chain import PLACE_OF_NUMBER, Chains, of_recording, with_values
-from aeropend_ident.diagnosis.chain.priors import free_swinging
-from aeropend_ident.diagnosis.chain.pwm_timing import timed
-from aeropend_ident.diagnosis.experiment_design import EXPERIMENTS, within
-from aeropend_ident.diagnosis.joint_fit import neutral
+from aeropend_ident.diagnosis import conclude, regions
+from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
+from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model
+from aeropend_ident.diagnosis.chain.pwm_timing import with_pwm_timing
+from aeropend_ident.diagnosis.chain.values import PLACE_OF_CHANNEL, PLACE_OF_PARAMETER, neutral, of_rig, with_values
+from aeropend_ident.diagnosis.conclude import Statistical
+from aeropend_ident.diagnosis.experiment_design import EXPERIMENTS, experiments_within
+from aeropend_ident.diagnosis.free_run_gap import Gap, HeldOut, closure
+from aeropend_ident.diagnosis.joint_fit import JointFit, fit_jointly
+from aeropend_ident.diagnosis.policy import GOOD_ENOUGH, policy_of
 from aeropend_ident.diagnosis.search import gust, speed_spikes, unknown_effect
-from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
-from aeropend_ident.diagnosis.search.search import Findings, refit, search
-from aeropend_ident.diagnosis.search.selection import GOOD_ENOUGH, Weighed
+from aeropend_ident.diagnosis.search.findings import Findings
+from aeropend_ident.diagnosis.search.search import refit, search
+from aeropend_ident.diagnosis.search.unknown_effect import UnknownEffect
+from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import CHANNELS, Signals
+from aeropend_ident.signals.statistics import rms
 from aeropend_sim.model.parameters import Model
 
 Array = NDArray[np.float64]
 
+CUT_SHORT = ("the search was cut short to bound its time: an effect beside the first, or a rival close to it, may have "
+             "been missed")
+
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found.
+    """The result of a diagnosis.
 
     Attributes:
-        model: the nominal model, of a rig whose numbers nobody knows the identified one.
-        augmented: with refitted numbers and found effects.
-        signals: the recordings. before, after: channel -> (N,) free-run readings, per recording.
-        body: the content of `diagnosis.json` from `channels` on (contract section 5).
-        misfit: what the nominal structure leaves where it fits worst, and the variables beside it, name -> (M,).
+        model: the nominal model; the identified one for an uncalibrated rig.
+        augmented: with refitted parameters and the effects found.
+        signals: the recordings.
+        before: channel -> (N,) free-run readings of the nominal model, one a recording.
+        after: the same of the augmented model.
+        body: the content of `diagnosis.json` from `channels` on.
+        misfit: of the nominal structure where it fits worst.
     """
 
     model: Model
@@ -46,159 +60,233 @@ class Diagnosis:
     before: Sequence[Mapping[str, Array]]
     after: Sequence[Mapping[str, Array]]
     body: dict[str, object]
-    misfit: Mapping[str, Array]
+    misfit: regions.Misfit
 
 
 Progress = Callable[[str, float], None]
-"""Called with what is being done and the share (0..1) that is behind."""
+"""Called with the present step and the share (0 to 1) of the work that is done."""
 
 
 def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progress: Progress = lambda *_: None, *,
              fit_nominal: bool = False) -> Diagnosis:
-    """Find where a model and a rig part, by which effect, and how far the gap closes.
+    """Find where a model and a rig differ, which effect causes it, and how far the gap closes.
 
     Args:
-        model: the nominal model, with effects already known to be there.
+        model: the nominal model, with effects that are known to be there.
         recordings: one or more of one rig.
-        jobs: threads.
-        progress: told how far it is.
-        fit_nominal: the model's numbers are only a guess, good to a factor of three.
+        jobs: threads; the result does not depend on them.
+        progress: called as the work goes on.
+        fit_nominal: whether the rig is uncalibrated: its parameters are known to a factor of three at best.
     """
-    if fit_nominal:
-        progress("identifying the nominal model", 0.0)
-        with threadpool_limits(1):
-            model, recordings = nominal_fit.identify(model, recordings)
-    with threadpool_limits(1):  # the matrices are narrow: threads of the linear algebra only get in each other's way
-        chains = ThriftyChains(model, recordings) if fit_nominal else Chains(model, recordings)
-        return _diagnose(timed(chains), jobs, progress)
+    with threadpool_limits(1):  # the matrices are narrow: threads of the linear algebra would slow each other down
+        if fit_nominal:
+            progress("identifying the nominal model", 0.0)
+            model, recordings = fit_nominal_model(model, recordings)
+        policy = policy_of(recordings, fit_nominal=fit_nominal)
+        kind = CutChains if policy.calibrated else CachedChains
+        return _diagnose(with_pwm_timing(kind(model, recordings, policy)), jobs, progress)
 
 
-def _diagnose(chains: Chains, jobs: int, progress: Progress) -> Diagnosis:
-    model, recordings = chains.model, chains.recordings
-    fitted = chains
-    if chains.fit_nominal and free_swinging(recordings):  # few swings: what brakes them shows in the last ones too
-        chains = Chains(model, [replace(s, train=len(s)) for s in recordings], fit_nominal=True)
-    findings = search(chains, jobs, lambda block, share: progress(f"weighing effects of the {block}", 0.7 * share))
-    if any(f.cut_short for f in findings.values()):
-        said = ("the search was cut short to bound its time: an effect beside the first, or a rival close to it, may "
-                "have been missed")
-        recordings = [replace(s, notes=(*s.notes, said)) for s in recordings]
-    progress("looking for chance", 0.7)
-    spikes = speed_spikes.found(recordings)
-    torque = gust.found(chains, findings["arm"])
-    misfit, variables = regions.misfit_signal(chains, findings)
-    strange = unknown_effect.found(chains, findings, torque is not None, bool(spikes))
-    progress("fitting the whole chain", 0.75)
-    settled = joint_fit.settle(chains, findings, torque is not None)
-    values, sd = settled.values, settled.sd
-    # of an unknown rig the identified numbers, those of each run, are the nominal model
-    base_values = {n: v for f in findings.values() for n, v in f.base.values.items()
-                   if n.startswith("initial.") or chains.fit_nominal}
+@dataclass(frozen=True)
+class _Findings:
+    """What the search and the detectors found.
+
+    Attributes:
+        chains: cut, with the inputs that the search has set.
+        stages: stage -> what was found.
+        statistical: effects that were detected by their statistics.
+        unknown: an effect that the catalogue does not hold.
+        misfit: of the nominal structure where it fits worst.
+        recordings: with the notes of the search.
+    """
+
+    chains: CutChains
+    stages: Mapping[str, Findings]
+    statistical: Statistical
+    unknown: UnknownEffect | None
+    misfit: regions.Misfit
+    recordings: Sequence[Signals]
+
+
+@dataclass(frozen=True)
+class _Gaps:
+    """The gap before and after, with everything that measures it.
+
+    Attributes:
+        held_out: measures gaps.
+        base: values of the nominal model by name, with the initial states.
+        runs_before: free runs of the nominal model, one a recording.
+        runs_after: the same of the augmented model.
+        before: gap of the nominal model.
+        after: gap of the augmented model.
+        floors: channel -> floor.
+    """
+
+    held_out: HeldOut
+    base: Mapping[str, float]
+    runs_before: Sequence[Mapping[str, Array]]
+    runs_after: Sequence[Mapping[str, Array]]
+    before: Gap
+    after: Gap
+    floors: Mapping[str, float]
+
+
+def _diagnose(fitted: CutChains, jobs: int, progress: Progress) -> Diagnosis:
+    """The steps after the chain is cut; `fitted`: the chains whose training part parameters are fitted to."""
+    found = _find(fitted, jobs, progress)
+    progress("fitting all jointly", 0.75)
+    joint = fit_jointly(found.chains, found.stages, gust=found.statistical.gust is not None)
+    found = replace(found, stages=joint.findings)
     progress("measuring the gap", 0.9)
-    judged = values
-    if fitted is not chains:
-        base_values, judged = (refit(fitted, "arm", effects, start).values for start, effects in (
-            (base_values, []), (values, findings["arm"].effects)))
-    before = [free_run_gap.free_run(model, s, chains.own(base_values, k)) for k, s in enumerate(recordings)]
-    after = [free_run_gap.free_run(model, s, chains.own(judged, k)) for k, s in enumerate(recordings)]
-    found = [h for f in findings.values() for h in f.effects]
-    scorer = free_run_gap.Scorer(chains, model, recordings, bool(spikes))
-    gap_before, gap_after = scorer.gap(before, known=False), scorer.gap(after)
-    floors = scorer.floors()
-    share, low, high = free_run_gap.closed(gap_before, gap_after, floors)
+    gaps = _measure(fitted, found, joint)
+    body = _conclude(found, joint, gaps)
+    model, chains = found.chains.model, found.chains
+    nominal = model if chains.policy.calibrated else with_values(model, of_rig(gaps.base))
+    progress("done", 1.0)
+    return Diagnosis(nominal, _augmented(model, joint.values, found.statistical), found.recordings, gaps.runs_before,
+                     gaps.runs_after, body, found.misfit)
 
-    unexplained = _unexplained(findings, gap_after, floors)
-    if strange is not None and unexplained:
-        unexplained = {strange.shape.place: sum(unexplained.values())}
-    amounts = _amounts(found, values, scorer, torque, spikes, before, unexplained)
-    candidates = conclude.candidates(findings, values, sd, torque, spikes, scorer, gap_after.total)
+
+def _find(fitted: CutChains, jobs: int, progress: Progress) -> _Findings:
+    """Search effects, detect those that only statistics show, and judge whether one is unknown."""
+    chains, recordings = fitted, fitted.recordings
+    if not fitted.policy.driven:  # a decay has few swings: effects are selected on all of them
+        chains = CutChains(fitted.model, [replace(s, train=len(s)) for s in recordings], fitted.policy)
+    stages = search(chains, jobs, lambda stage, share: progress(f"searching effects of the {stage}", 0.7 * share))
+    if any(f.cut_short for f in stages.values()):
+        recordings = [s.noted(CUT_SHORT) for s in recordings]
+    progress("testing for random effects", 0.7)
+    spikes = speed_spikes.detect(recordings)
+    detected = gust.detect(chains, stages["arm"])
+    stages = {**stages, "arm": detected.arm}
+    misfit = regions.largest_misfit(chains, stages)
+    unknown, stages = unknown_effect.judge(chains, stages, gust=detected.gust is not None, spikes=spikes is not None)
+    return _Findings(chains, stages, Statistical(detected.gust, spikes), unknown, misfit, recordings)
+
+
+def _measure(fitted: CutChains, found: _Findings, joint: JointFit) -> _Gaps:
+    """The gap on held-out data before and after."""
+    chains, model = found.chains, found.chains.model
+    # the identified parameters of an uncalibrated rig, those of each recording, are its nominal model
+    base = {n: v for f in found.stages.values() for n, v in f.base.values.items()
+            if key(n).is_initial or not chains.policy.calibrated}
+    values: Mapping[str, float] = joint.values
+    if fitted is not chains:  # what was selected on the whole decay is fitted again to its training part
+        base = refit(fitted, "arm", [], base).values
+        values = refit(fitted, "arm", found.stages["arm"].effects, values).values
+    held_out = HeldOut(chains, model, found.recordings, spikes=found.statistical.spikes is not None)
+    before, after = held_out.runs(base), held_out.runs(values)
+    return _Gaps(held_out, base, before, after, held_out.gap(before, known=False), held_out.gap(after),
+                 held_out.floors())
+
+
+def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps) -> dict[str, object]:
+    """The content of `diagnosis.json` from `channels` on."""
+    chains, stages, unknown = found.chains, found.stages, found.unknown
+    calibrated = chains.policy.calibrated
+    candidates = conclude.candidates(stages, joint, found.statistical, gaps.held_out, gaps.after.total)
+    amounts = _amounts(found, joint.values, gaps)
+    verdict, place, effects = _verdict(amounts, unknown)
     reasons = [f"{c} is off by {x:.1f} times a reading's noise"
-               for c, x in _left(findings, torque is not None).items() if x > GOOD_ENOUGH]
-    parts = regions.shares((place, amount) for _, place, amount in amounts)
-    ranked = sorted((a for a in amounts if a[0]), key=lambda a: -a[2])
-    effects = list(dict.fromkeys(name.partition(":")[0] for name, _, _ in ranked))
-    verdict, place = (effects[0], ranked[0][1]) if ranked else ("none", "none")
-    if strange is not None and (strange.first or not effects):
-        verdict, place = "unknown", strange.shape.place
-
-    least = conclude.UNDECIDED_UNKNOWN if chains.fit_nominal else conclude.UNDECIDED
-    undecided = conclude.not_separable(findings, least)
-    tried = within(max(float(s.duty.max()) for s in recordings)) if chains.fit_nominal else EXPERIMENTS
-    augmented = _augmented(model, values, torque, spikes)
-    rows = conclude.numbers(chains, values, sd)
-    names = [c for c in CHANNELS if c in gap_before.rms]
+               for c, x in _left(stages, gust=found.statistical.gust is not None).items() if x > GOOD_ENOUGH]
+    undecided = conclude.not_separable(stages, chains.policy.undecided)
+    tried = EXPERIMENTS if calibrated else experiments_within(max(float(s.duty.max()) for s in found.recordings))
+    rows = conclude.parameter_rows(chains, joint)
+    share, low, high = closure(gaps.before, gaps.after, gaps.floors)
     body: dict[str, object] = {
-        "channels": {c: {"unit": CHANNELS[c], "gap": gap_before.rms[c], "floor": floors[c],
-                         "gap_after": gap_after.rms[c]} for c in names},
-        "where": {"place": place, "share": parts, "regions": regions.regions(misfit, variables)},
-        "which": {"verdict": verdict, "effects": effects, "candidates": candidates,
-                  "numbers": rows,
+        "channels": {c: {"unit": CHANNELS[c], "gap": gaps.before.rms[c], "floor": gaps.floors[c],
+                         "gap_after": gaps.after.rms[c]} for c in CHANNELS if c in gaps.before.rms},
+        "where": {"place": place, "share": regions.shares((p, amount) for _, p, amount in amounts),
+                  "regions": [vars(r) for r in regions.regions(found.misfit)]},
+        "which": {"verdict": verdict, "effects": effects, "candidates": candidates, "numbers": rows,
                   "residuals": {channel: {"rms": check.rms[channel], "white": check.white[channel],
                                           "dependence": check.dependence}
-                                for check in settled.checks.values() for channel in check.rms},
-                  "unexplained": reasons, "unknown": strange.document() if strange is not None else None,
+                                for check in joint.checks.values() for channel in check.rms},
+                  "unexplained": reasons, "unknown": None if unknown is None else _curves(unknown),
                   "not_separable": [list(conclude.names(a, b)) for a, b in undecided],
-                  "next_experiment": conclude.next_experiment(model, recordings[0], undecided, values, tried)},
-        "shrink": {"gap": gap_before.total, "gap_after": gap_after.total, "floor": scorer.bottom(gap_before, floors),
-                   "closed": share, "low": low, "high": high},
+                  "next_experiment": conclude.next_experiment(chains.model, found.recordings[0], undecided,
+                                                              joint.values, tried)},
+        "shrink": {"gap": gaps.before.total, "gap_after": gaps.after.total,
+                   "floor": gaps.before.total_floor(gaps.floors), "closed": share, "low": low, "high": high},
     }
-    if chains.fit_nominal:
-        body["identified"] = conclude.identified_model(chains, values, sd, rows)
-        model = with_values(model, nominal_fit.shared(base_values))
-    progress("done", 1.0)
-    return Diagnosis(model, augmented, recordings, before, after, body, {"misfit": misfit, **variables})
+    if not calibrated:
+        body["identified"] = conclude.identified_model(chains, joint, rows)
+    return body
 
 
-def _amounts(found: Sequence[Hypothesis], values: Mapping[str, float], scorer: free_run_gap.Scorer,
-             torque: Weighed | None, spikes: Weighed | None, before: Sequence[Mapping[str, Array]],
-             unexplained: dict[str, float]) -> list[tuple[str, str, float]]:
-    """(name, place, squared gap) of each finding: what comes back when it is taken out; no name for what is not one."""
-    model, best = scorer.model, scorer.squared(values)
+def _verdict(amounts: Sequence[tuple[str, str, float]], unknown: UnknownEffect | None) -> tuple[str, str, list[str]]:
+    """The verdict, its place, and the effects found, the largest first."""
+    ranked = sorted((a for a in amounts if a[0]), key=lambda a: -a[2])
+    effects = list(dict.fromkeys(name.partition(":")[0] for name, _, _ in ranked))
+    if unknown is not None and (unknown.first or not effects):
+        return "unknown", unknown.term.place, effects
+    return (effects[0], ranked[0][1], effects) if ranked else ("none", "none", effects)
+
+
+def _curves(unknown: UnknownEffect) -> dict[str, object]:
+    return {"place": unknown.term.place,
+            "curves": [{"variable": c.variable, "unit": c.unit, "at": c.knot.tolist(), "value": c.value.tolist()}
+                       for c in unknown.term.curves]}
+
+
+def _amounts(found: _Findings, values: Mapping[str, float], gaps: _Gaps) -> list[tuple[str, str, float]]:
+    """Name, place and squared gap of each finding: the gap that comes back when it is taken out.
+
+    Entries without a name are no findings: what stays unexplained at a place; if there is neither, the share of each
+    place in the gap that nominal parameters leave.
+    """
+    held_out, statistical = gaps.held_out, found.statistical
+    best = held_out.gap_of(values).total ** 2
+    unexplained = _unexplained(found.stages, gaps.after, gaps.floors)
+    if found.unknown is not None and unexplained:
+        unexplained = {found.unknown.term.place: sum(unexplained.values())}
 
     def comes_back(nominal: Mapping[str, float]) -> float:
-        return max(scorer.squared({**values, **nominal}) - best, 0.0)
+        return max(held_out.gap_of({**values, **nominal}).total ** 2 - best, 0.0)
 
-    amounts = [(h.name, h.place, comes_back({u.name: neutral(model, u.name) for u in h.starts[0]})) for h in found]
-    if torque is not None:
-        amounts.append((torque.hypothesis.name, torque.hypothesis.place, unexplained.pop("arm", 0.0)))
-    if spikes is not None:
-        with_, without = scorer.gap(before, known=False), scorer.gap(before)
-        amounts.append((spikes.hypothesis.name, spikes.hypothesis.place, max(with_.total**2 - without.total**2, 0.0)))
+    effects = [h for f in found.stages.values() for h in f.effects]
+    amounts = [(h.name, h.place, comes_back({p.name: neutral(held_out.model, p.name) for p in h.own}))
+               for h in effects]
+    if statistical.gust is not None:
+        h = statistical.gust.hypothesis
+        amounts.append((h.name, h.place, unexplained.pop("arm", 0.0)))
+    if statistical.spikes is not None:
+        h = statistical.spikes.hypothesis
+        with_, without = held_out.gap(gaps.runs_before, known=False), held_out.gap(gaps.runs_before)
+        amounts.append((h.name, h.place, max(with_.total**2 - without.total**2, 0.0)))
     amounts += [("", place, amount) for place, amount in unexplained.items()]
-    if not amounts:  # nothing but numbers within their uncertainty: how the gap that they leave is shared
-        for place in dict.fromkeys(PLACE_OF_NUMBER.values()):
-            back = {n: model.model[n] for n in values if PLACE_OF_NUMBER.get(n) == place}
+    if not amounts:
+        for place in dict.fromkeys(PLACE_OF_PARAMETER.values()):
+            back = {n: held_out.model.model[n] for n in values if PLACE_OF_PARAMETER.get(n) == place}
             amounts.append(("", place, comes_back(back)))
     return amounts
 
 
-def _left(findings: Mapping[str, Findings], torque: bool) -> dict[str, float]:
-    """Channel -> RMS of what is left in its part of the cut chain, in units of a reading's noise."""
+def _left(findings: Mapping[str, Findings], *, gust: bool) -> dict[str, float]:
+    """Channel -> RMS of the residual that is left in its stage, in units of a reading's noise."""
     left: dict[str, float] = {}
-    for block, f in findings.items():
+    for stage, f in findings.items():
         for channel, r in f.final.residuals.items():
-            if not (torque and block == "arm"):
-                name = of_recording(channel)[0]
-                left[name] = max(left.get(name, 0.0), float(np.sqrt(np.mean(r * r))))
+            if not (gust and stage == "arm"):
+                name = key(channel).name
+                left[name] = max(left.get(name, 0.0), rms(r))
     return left
 
 
-def _unexplained(findings: Mapping[str, Findings], after: free_run_gap.Gap, floors: Mapping[str, float]
-                 ) -> dict[str, float]:
-    """Place -> squared gap that is left there: what the cut chain leaves above the floor."""
-    home = {"v_a": "actuator", "i_a": "electrical", "omega": "rotor", "theta": "arm"}
+def _unexplained(findings: Mapping[str, Findings], after: Gap, floors: Mapping[str, float]) -> dict[str, float]:
+    """Place -> squared gap that its channel keeps above the floor in the cut chain."""
     left: dict[str, float] = {}
     for f in findings.values():
         for channel, r in f.final.residuals.items():
-            name = of_recording(channel)[0]
+            name = key(channel).name
             excess = float(np.mean(r * r)) - GOOD_ENOUGH**2
             if excess > 0.0 and name in after.spread:
-                left[home[name]] = excess * (floors[name] / after.spread[name]) ** 2 / len(after.spread)
+                left[PLACE_OF_CHANNEL[name]] = excess * (floors[name] / after.spread[name]) ** 2 / len(after.spread)
     return left
 
 
-def _augmented(model: Model, values: Mapping[str, float], torque: Weighed | None, spikes: Weighed | None) -> Model:
+def _augmented(model: Model, values: Mapping[str, float], statistical: Statistical) -> Model:
     """The model with all that was found, ready for the plant node."""
-    extra = {n: v for w in (torque, spikes) if w is not None for n, v in w.fit.values.items()}
-    m = with_values(model, {**nominal_fit.shared(values), **extra})
+    extra = {n: v for found in statistical.found for n, v in found.fit.values.items()}
+    m = with_values(model, {**of_rig(values), **extra})
     return Model(f"{model.name}, augmented", m.model, m.sensing, m.effects)

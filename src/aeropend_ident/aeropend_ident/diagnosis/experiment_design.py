@@ -1,22 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which experiment would tell hypotheses apart that a recording cannot.
+"""The experiment that would separate hypotheses that a recording cannot.
 
-What counts is not how far their readings differ, but how far they still differ after everything that may be refitted
-has been: on each signal tried, the difference is projected off the slopes of the readings with respect to the numbers
-of the model, within their uncertainty, and to the hypotheses' own parameters.
+Hypotheses separate on an excitation signal if their readings still differ after everything has been refitted: the
+parameters of the model within their uncertainty, and the hypotheses' own parameters (optimal design for model
+discrimination: A. Atkinson and V. Fedorov, Biometrika 62, 1975). Some signals are tried.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis.chain.priors import NUMBER_SD
+from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD
+from aeropend_ident.diagnosis.chain.values import clipped
 from aeropend_ident.diagnosis.free_run_gap import free_run
+from aeropend_ident.estimation.map_fit import DAMPING, DAMPING_DOWN
+from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import CHANNELS, Signals
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
 from aeropend_sim.model.excitation import Excitation
@@ -24,7 +27,7 @@ from aeropend_sim.model.parameters import MODEL_NAMES, PARAMETERS, SAMPLE_PERIOD
 
 Array = NDArray[np.float64]
 Named = tuple[str, Mapping[str, float]]
-"""A hypothesis: what it is called (`thrust_lag`, `parameter_mismatch:K_t`), and its fitted numbers and effects."""
+"""A hypothesis: its name (`thrust_lag`, `parameter_mismatch:K_t`), and its fitted parameters and effects."""
 
 EXPERIMENTS = (
     Excitation("latin_hypercube", 60.0, duty_max=0.6),
@@ -38,23 +41,38 @@ EXPERIMENTS = (
     Excitation("free_decay", 60.0, duty=0.3, hold_max=4.0, rest=6.0),
     Excitation("hold", 60.0, duty=0.45),
 )
-"""What is tried, as `excite` would run it."""
+"""The signals that are tried, as `excite` plays them: each kind, fast and slow, low and high (choice)."""
 
-APART = 10.0
-"""Standard deviations by which two hypotheses must differ on a new recording to be told apart on it."""
+SEPARATE = 10.0
+"""Standard deviations by which two hypotheses must differ on a recording to separate on it.
+
+Choice: far above chance, since noise of a rig is never quite white."""
 
 LONGEST = 300.0
-"""s that an experiment may last."""
+"""[s] Longest experiment (choice)."""
 
 REFITS = 10
-"""Steps of a refit."""
+"""Steps of a refit (choice: it stops earlier when it gains little)."""
 
 STEP = 0.01
-"""Standard deviations of its prior by which a parameter is varied to see what it does."""
+"""Standard deviations of its prior by which a parameter is varied for a derivative."""
+
+REJECTED = 30.0
+"""Factor on the damping after a step that fails: the slopes are approximate, so a far shorter one is tried."""
+
+ENOUGH, ENOUGH_OF_COST = 0.1, 0.05
+"""Decrease of the squared distance below which a refit stops: absolute, and relative. The result is rounded to 1."""
+
+Distance = tuple[float, str]
+"""Standard deviations by which two hypotheses differ, and the channel that shows most of it."""
 
 
-def within(top: float) -> tuple[Excitation, ...]:
-    """Experiments for a rig of which it is only known that it bears a duty of `top`: one of each kind."""
+def experiments_within(top: float) -> tuple[Excitation, ...]:
+    """One signal of each kind for a rig of which only the largest duty so far is known.
+
+    Args:
+        top: largest duty that the rig has been given.
+    """
     top = max(math.floor(100.0 * top), 2) / 100.0
     return (Excitation("latin_hypercube", 60.0, duty_max=top),
             Excitation("steps", 60.0, hold_max=5.0, sequence=(0.0, round(0.7 * top, 3))),
@@ -64,129 +82,183 @@ def within(top: float) -> tuple[Excitation, ...]:
 
 def advise(model: Model, signals: Signals, first: Named, rivals: Sequence[Named],
            experiments: Sequence[Excitation] = EXPERIMENTS) -> dict[str, object]:
-    """Choose the duty signal on which a hypothesis differs most from each of its rivals, whatever is refitted.
+    """Choose the signal on which a hypothesis differs most from each of its rivals after a refit.
 
     Args:
-        model: the nominal model. signals: the recording that does not tell them apart; its channels and their noise
-            are taken.
-        first: the hypothesis. rivals: at least one. An effect at its neutral size is no part of a hypothesis.
-        experiments: what is tried.
+        model: the nominal model.
+        signals: the recording that does not separate them; gives the channels and their noise.
+        first: the hypothesis.
+        rivals: at least one. An effect at its neutral size is no part of a hypothesis.
+        experiments: the signals that are tried.
 
     Returns:
-        `why` in words, and `excite`: parameters of that node, empty where no signal helps (contract section 5).
+        `why` in words, and `excite`: parameters of that node, empty where no signal helps.
     """
-    tried = {e: _distances(model, signals, first, rivals, e) for e in experiments}
+    tried = {e: distances(model, signals, first, rivals, e) for e in experiments}
     # a difference grows with the square root of the time
     grown = {e: [d * math.sqrt(LONGEST / e.duration) for d, _ in tried[e]] for e in experiments}
-    helped = [k for k in range(len(rivals)) if max(grown[e][k] for e in experiments) > APART]
-    alike = "; ".join(f"{first[0]} and {rivals[k][0]} give the same readings under every signal tried: to tell them "
-                      f"apart, {_directly(model, first, rivals[k])}" for k in range(len(rivals)) if k not in helped)
+    helped = [k for k in range(len(rivals)) if max(grown[e][k] for e in experiments) > SEPARATE]
+    alike = "; ".join(f"{first[0]} and {rivals[k][0]} give the same readings under every signal tried: to separate "
+                      f"them, {_directly(model, first, rivals[k])}" for k in range(len(rivals)) if k not in helped)
     if not helped:
         return {"why": alike, "excite": {}}
     best = max(experiments, key=lambda e: min(tried[e][k][0] for k in helped))
-    shortfall = APART / max(min(tried[best][k][0] for k in helped), 1e-9)
+    shortfall = SEPARATE / max(min(tried[best][k][0] for k in helped), 1e-9)
     if shortfall > 1.0:
         best = replace(best, duration=min(math.ceil(best.duration * shortfall**2 / 30.0) * 30.0, LONGEST))
-        tried[best] = _distances(model, signals, first, rivals, best)
+        tried[best] = distances(model, signals, first, rivals, best)
     default = asdict(Excitation(best.kind))
     chosen = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(best).items()
               if k in ("kind", "duration") or v != default[k]}
     texts = [f"from {rivals[k][0]} by {tried[best][k][0]:.0f} standard deviations, most in {tried[best][k][1]}"
              for k in helped]
-    why = f"{first[0]} still differs there {', '.join(texts)}, after the numbers are refitted"
+    why = f"with this signal {first[0]} differs {', '.join(texts)}, after the parameters are refitted"
     return {"why": f"{why}; {alike}" if alike else why, "excite": chosen}
 
 
 def next_experiment(model: Model, signals: Signals, first: Mapping[str, float], second: Mapping[str, float],
                     names: tuple[str, str], experiments: Sequence[Excitation] = EXPERIMENTS) -> dict[str, object]:
-    """As `advise`, for two hypotheses."""
+    """As `advise`, for two hypotheses.
+
+    Args:
+        model: the nominal model.
+        signals: the recording that does not separate them.
+        first: values of the one hypothesis.
+        second: values of the other.
+        names: of both.
+        experiments: the signals that are tried.
+    """
     return advise(model, signals, (names[0], first), [(names[1], second)], experiments)
 
 
-def _distances(model: Model, signals: Signals, first: Named, rivals: Sequence[Named], excitation: Excitation
-               ) -> list[tuple[float, str]]:
-    """How many standard deviations each rival stays away from a hypothesis, and the channel that shows most.
+def distances(model: Model, signals: Signals, first: Named, rivals: Sequence[Named], excitation: Excitation
+              ) -> list[Distance]:
+    """Distance of each rival from a hypothesis on a signal.
 
-    Either may be the truth that the other is refitted to; the smaller distance counts.
+    Either may be the truth to which the other is refitted; the smaller distance counts.
+
+    Args:
+        model: the nominal model.
+        signals: a recording that gives the channels and their noise.
+        first: the hypothesis.
+        rivals: of it.
+        excitation: the signal.
     """
-    duty = excitation.series()
-    nothing = np.full(len(duty), np.nan)
-    planned = replace(signals, period=SAMPLE_PERIOD, duty=duty, theta=nothing, omega=nothing, i_a=nothing, v_a=nothing,
-                      pulses=None, false_speed=np.zeros(len(duty), dtype=bool), train=len(duty))
-    channels = [c for c in CHANNELS if signals.has(c)]
-    noise = _noise(signals)
+    planned = _Planned.of(model, signals, first[1], excitation)
+    nominal = {n: NOMINAL_SD * abs(model.model[n]) for n in MODEL_NAMES if n in first[1] and model.model[n] != 0.0}
+    at_first = planned.readings(first[1])
+    slope_of = dict(zip(nominal, planned.slopes(first[1], at_first, nominal), strict=True))
 
-    def run(values: Mapping[str, float]) -> dict[str, Array]:
-        return free_run(model, planned, {k: v for k, v in values.items() if not k.startswith("initial.")})
+    def refittable(values: Mapping[str, float], here: Array) -> _Refit:
+        own = _free(model, values)
+        new = {n: sd for n, sd in own.items() if n not in nominal}
+        rows = [x * own.get(n, sd) / sd for (n, sd), x in zip(nominal.items(), slope_of.values(), strict=True)]
+        return _Refit(planned, values, here, np.vstack([*rows, planned.slopes(values, here, new)]), {**nominal, **own})
 
-    shown = dict.fromkeys(channels, np.arange(len(duty)))
-    readings = run(first[1])
-    if signals.pulses is not None:  # the speed is read once a pulse
-        turn = 2.0 * math.pi / model.sensing["speed_pulses_per_rev"]
-        shown["omega"] = np.flatnonzero(np.diff(np.floor(np.cumsum(readings["omega"]) * SAMPLE_PERIOD / turn)))
+    of_first = refittable(first[1], at_first)
+    found = []
+    for _, values in rivals:
+        here = planned.readings(values)
+        found.append(min(refittable(values, here).distance(at_first), of_first.distance(here)))
+    return found
 
-    def stacked(readings: Mapping[str, Array]) -> Array:
-        return np.concatenate([readings[c][shown[c]] / noise[c] for c in channels])
 
-    def slopes(values: Mapping[str, float], here: Array, scales: Mapping[str, float]) -> Array:
-        """What a standard deviation of each parameter does to the readings, (P, M)."""
-        rows = [(stacked(run({**values, n: values[n] + STEP * sd})) - here) / STEP for n, sd in scales.items()]
+@dataclass(frozen=True)
+class _Planned:
+    """A recording that an excitation signal would give.
+
+    Attributes:
+        model: the nominal model.
+        signals: with the duty and without readings.
+        shown: channel -> samples that are read.
+        noise: channel -> standard deviation of a reading.
+    """
+
+    model: Model
+    signals: Signals
+    shown: Mapping[str, NDArray[np.int64]]
+    noise: Mapping[str, float]
+
+    @classmethod
+    def of(cls, model: Model, signals: Signals, values: Mapping[str, float], excitation: Excitation) -> _Planned:
+        """Plan a recording with the channels and the noise of `signals`; `values` give the pulses of the speed."""
+        duty = excitation.series()
+        nothing = np.full(len(duty), np.nan)
+        plan = replace(signals, period=SAMPLE_PERIOD, duty=duty, theta=nothing, omega=nothing, i_a=nothing,
+                       v_a=nothing, pulses=None, false_speed=np.zeros(len(duty), dtype=bool), train=len(duty))
+        shown = {c: np.arange(len(duty)) for c in CHANNELS if signals.has(c)}
+        planned = cls(model, plan, shown, _noise(signals))
+        if signals.pulses is not None:  # the speed is read once a pulse
+            turn = 2.0 * math.pi / model.sensing["speed_pulses_per_rev"]
+            angle = np.cumsum(planned.run(values)["omega"]) * SAMPLE_PERIOD
+            shown["omega"] = np.flatnonzero(np.diff(np.floor(angle / turn)))
+        return planned
+
+    def run(self, values: Mapping[str, float]) -> dict[str, Array]:
+        """Channel -> (N,) readings of a free run from rest."""
+        return free_run(self.model, self.signals, {k: v for k, v in values.items() if not key(k).is_initial})
+
+    def readings(self, values: Mapping[str, float]) -> Array:
+        """(M,) All readings in units of their noise."""
+        run = self.run(values)
+        return np.concatenate([run[c][at] / self.noise[c] for c, at in self.shown.items()])
+
+    def slopes(self, values: Mapping[str, float], here: Array, scales: Mapping[str, float]) -> Array:
+        """(P, M) Change of the readings (M,) by a standard deviation of each of P values."""
+        rows = [(self.readings({**values, n: values[n] + STEP * sd}) - here) / STEP for n, sd in scales.items()]
         return np.array(rows).reshape(len(rows), len(here))
 
-    def apart(truth: Array, values: Mapping[str, float], here: Array, rows: Array, scales: Mapping[str, float]
-              ) -> tuple[float, str]:
-        """How far readings (M,) stay from a hypothesis that is refitted to them: Gauss-Newton, slopes by Broyden."""
-        z, damping, rows = np.zeros(len(rows)), 1e-3, rows.copy()
+
+@dataclass(frozen=True)
+class _Refit:
+    """A hypothesis that is refitted to the readings of another.
+
+    Attributes:
+        planned: the recording.
+        values: of the hypothesis.
+        here: (M,) its readings.
+        rows: (P, M) their slopes with respect to what may be refitted.
+        scales: standard deviations of the P values.
+    """
+
+    planned: _Planned
+    values: Mapping[str, float]
+    here: Array
+    rows: Array
+    scales: Mapping[str, float]
+
+    def distance(self, truth: Array) -> Distance:
+        """Distance from the readings (M,) of another hypothesis after the refit.
+
+        Levenberg-Marquardt steps; Broyden's rank-one updates of the slopes spare most simulations.
+        """
+        z, damping, rows, here = np.zeros(len(self.rows)), DAMPING, self.rows.copy(), self.here
         cost = float((truth - here) @ (truth - here))
         for _ in range(REFITS):
             information = rows @ rows.T + np.eye(len(rows))
             step = np.linalg.solve(information + damping * np.diag(np.diag(information)), rows @ (truth - here) - z)
-            trial = stacked(run({**values, **{n: _within(n, values[n] + sd * x)
-                                              for (n, sd), x in zip(scales.items(), z + step, strict=True)}}))
+            trial = self.planned.readings({**self.values, **{
+                n: clipped(n, self.values[n] + sd * x)
+                for (n, sd), x in zip(self.scales.items(), z + step, strict=True)}})
             if not step.any():
                 break
             rows += np.outer(step, trial - here - step @ rows) / float(step @ step)
             new = float((truth - trial) @ (truth - trial) + (z + step) @ (z + step))
             gained = cost - new
             if gained < 0.0:
-                damping *= 30.0
+                damping *= REJECTED
                 continue
-            z, here, cost, damping = z + step, trial, new, 0.2 * damping
-            if gained < 0.05 * cost + 0.1:
+            z, here, cost, damping = z + step, trial, new, DAMPING_DOWN * damping
+            if gained < ENOUGH_OF_COST * cost + ENOUGH:
                 break
-        ends = np.cumsum([len(shown[c]) for c in channels])[:-1]
+        channels = list(self.planned.shown)
+        ends = np.cumsum([len(at) for at in self.planned.shown.values()])[:-1]
         parts = [float(x @ x) for x in np.split(truth - here, ends)]
         return math.sqrt(cost), channels[int(np.argmax(parts))]
 
-    at_first = stacked(readings)
-    numbers = {n: NUMBER_SD * abs(model.model[n]) for n in MODEL_NAMES if n in first[1] and model.model[n] != 0.0}
-    slope_of = dict(zip(numbers, slopes(first[1], at_first, numbers), strict=True))
-
-    def refittable(values: Mapping[str, float], here: Array) -> tuple[Array, dict[str, float]]:
-        """Slopes (P, M) of all that a hypothesis may refit, numbers and its own, and their standard deviations."""
-        own = _free(model, values)
-        new = {n: sd for n, sd in own.items() if n not in numbers}
-        rows = [x * own.get(n, sd) / sd for (n, sd), x in zip(numbers.items(), slope_of.values(), strict=True)]
-        return np.vstack([*rows, slopes(values, here, new)]), {**numbers, **own}
-
-    of_first = refittable(first[1], at_first)
-    distances = []
-    for _, values in rivals:
-        here = stacked(run(values))
-        distances.append(min(apart(at_first, values, here, *refittable(values, here)),
-                             apart(here, first[1], at_first, *of_first)))
-    return distances
-
-
-def _within(name: str, value: float) -> float:
-    """The value, or the end of its range."""
-    owner, _, parameter = name.partition(".")
-    p = CATALOGUE[owner].parameters[parameter] if parameter else PARAMETERS[f"model.{name}"]
-    return min(max(value, p.low), p.high)
-
 
 def _noise(signals: Signals) -> dict[str, float]:
-    """Channel -> standard deviation of a reading; of the speed that of a typical interval between pulses."""
+    """Channel -> standard deviation of a reading; for pulses that of a typical interval."""
     noise = dict(signals.sigma)
     if signals.pulses is not None and len(signals.pulses.sigma):
         noise["omega"] = float(np.median(signals.pulses.sigma))
@@ -194,30 +266,30 @@ def _noise(signals: Signals) -> dict[str, float]:
 
 
 def _free(model: Model, values: Mapping[str, float]) -> dict[str, float]:
-    """What a hypothesis itself may refit, and how widely: its effects' parameters, a number far off its nominal."""
+    """Values that a hypothesis itself may refit, with their range: its effects, a parameter far off its nominal."""
     free = {}
     for name, value in values.items():
-        owner, _, parameter = name.partition(".")
-        if owner in CATALOGUE:
-            effect, size = CATALOGUE[owner].parameters, CATALOGUE[owner].size
-            if values[f"{owner}.{size}"] != effect[size].neutral:
-                p = effect[parameter]
+        k = key(name)
+        if k.owner in CATALOGUE:
+            effect, size = CATALOGUE[k.owner].parameters, CATALOGUE[k.owner].size
+            if values[f"{k.owner}.{size}"] != effect[size].neutral:
+                p = effect[k.name]
                 free[name] = 3.0 * abs(p.default - p.neutral) or abs(p.default) or 1.0
-        elif owner in MODEL_NAMES and abs(value - model.model[owner]) > 3.0 * NUMBER_SD * abs(model.model[owner]):
-            free[name] = abs(value - model.model[owner])
+        elif name in MODEL_NAMES and abs(value - model.model[name]) > 3.0 * NOMINAL_SD * abs(model.model[name]):
+            free[name] = abs(value - model.model[name])
     return free
 
 
 def _directly(model: Model, first: Named, second: Named) -> str:
-    """What to measure by itself where no signal helps."""
+    """What to measure directly where no signal helps."""
     texts = []
     for name, values in (first, second):
-        effect, _, number = name.partition(":")
-        if number:
-            p, nominal = PARAMETERS[f"model.{number}"], model.model[number]
+        effect, _, parameter = name.partition(":")
+        if parameter:
+            p, nominal = PARAMETERS[f"model.{parameter}"], model.model[parameter]
             unit = "" if p.unit == "-" else f" {p.unit}"
-            near = abs(values[number] - nominal) / 3.0
-            texts.append(f"measure {number} ({p.description}) by itself to within {near:.2g}{unit}")
+            near = abs(values[parameter] - nominal) / 3.0
+            texts.append(f"measure {parameter} ({p.description}) directly to within {near:.2g}{unit}")
         elif effect != PARAMETER_MISMATCH:
-            texts.append(f"look for {effect} by itself ({CATALOGUE[effect].physics})")
-    return " or ".join(texts) or "measure the numbers of the model by themselves"
+            texts.append(f"look for {effect} directly ({CATALOGUE[effect].physics})")
+    return " or ".join(texts) or "measure the parameters of the model directly"

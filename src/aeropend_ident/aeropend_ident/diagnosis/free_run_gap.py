@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far the gap closes: free run from the applied duty alone, on data that nothing was fitted to."""
+"""The gap: the difference between rig and model in a free run from the duty alone, on held-out data."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis.chain.chain import Chains, mean_speed, with_values
+from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.values import with_values
+from aeropend_ident.signals.pulses import mean_speed
 from aeropend_ident.signals.signals import CHANNELS, Signals
 from aeropend_sim.model import actuator, dynamics, sensing
 from aeropend_sim.model.parameters import Model
@@ -18,20 +20,28 @@ from aeropend_sim.model.parameters import Model
 Array = NDArray[np.float64]
 
 WINDOW = 2.0
-"""s of one block of the bootstrap: longer than the arm remembers."""
+"""[s] Block of the bootstrap: several time constants of the arm, so that blocks are nearly independent."""
 
 RESAMPLES = 2000
+"""Resamples of the bootstrap: the ends of a 95 % interval then vary by about 2 % of its width."""
 
 AT_REST = 0.05
-"""A channel rests where its spread is below this share of its spread over the whole recording."""
+"""Share of its spread over the whole recording below which a channel rests on held-out data (choice)."""
+
+FEWEST = 10
+"""Readings of a channel below which it has no gap (choice)."""
+
+NOTHING_OPEN = 0.1
+"""Gap above the floor, in floors, below which nothing is left to close (choice)."""
 
 
 def free_run(model: Model, signals: Signals, values: Mapping[str, float] | None = None) -> dict[str, Array]:
-    """Simulate from the applied duty alone and read it as the rig would, without chance.
+    """Simulate the rig from the duty alone and read it as the rig would, without random effects.
 
     Args:
-        model: with its effects. signals: gives the duty and the instants of the pulses.
-        values: more numbers, effects and the initial state (`initial.theta`, ...).
+        model: with its effects.
+        signals: gives the duty and the instants of the pulses.
+        values: further parameters, effects, and the initial state (`initial.theta`, ...).
 
     Returns:
         Channel -> (N,) readings before noise and quantisation.
@@ -54,14 +64,14 @@ def free_run(model: Model, signals: Signals, values: Mapping[str, float] | None 
 
 
 def _held_speed(run: dynamics.Trajectory, signals: Signals) -> Array:
-    """The speed as the pulses of the recording would have timed it, held between them."""
+    """[rad/s] (N,) The speed as the pulses of the recording would have timed it, held between them."""
     p = signals.pulses
     if p is None or not len(p.index):
         return run.omega
     speed = mean_speed(run.rotor_angle, p.time, p.period, signals.period)
     last = np.searchsorted(p.index, np.arange(len(signals)), side="right") - 1
     held = np.where(last >= 0, speed[np.maximum(last, 0)], 0.0)
-    # where the rig reads no speed, the model counts as stopped too if it would have shown one pulse at most
+    # where the rig reads no speed, the model has stopped too if it would have shown one pulse at most
     stopped = signals.omega == 0.0
     back = np.maximum(np.arange(len(signals)) - round(sensing.SPEED_TIMEOUT / signals.period), 0)
     slow = run.rotor_angle - run.rotor_angle[back] < p.period[0] * p.omega[0]
@@ -70,10 +80,10 @@ def _held_speed(run: dynamics.Trajectory, signals: Signals) -> Array:
 
 @dataclass(frozen=True)
 class Gap:
-    """Difference between a model and a recording on held-out data.
+    """Difference between a model and a recording.
 
     Attributes:
-        rms: channel -> RMS of simulated minus measured, SI.
+        rms: channel -> RMS of simulated minus measured, in SI units.
         spread: channel -> standard deviation of the measured channel; of the whole recording where the channel rests.
         windows: (W, C) mean square over each bootstrap window, over spread squared.
     """
@@ -84,17 +94,24 @@ class Gap:
 
     @property
     def total(self) -> float:
-        """RMS over channels, each divided by its spread."""
+        """RMS over the channels, each over its spread."""
         return float(np.sqrt(np.mean([(self.rms[c] / self.spread[c]) ** 2 for c in self.rms])))
+
+    def total_floor(self, floors: Mapping[str, float]) -> float:
+        """The same of floors by channel: the total gap of a perfect model."""
+        return float(np.sqrt(np.mean([(floors[c] / self.spread[c]) ** 2 for c in self.rms])))
 
 
 def gap(readings: Mapping[str, Array], signals: Signals, start: int, stop: int,
         left_out: NDArray[np.bool_] | None = None) -> Gap:
-    """The gap between readings and a recording over samples start..stop.
+    """The gap between readings of a model and a recording.
 
     Args:
-        readings: channel -> (N,). signals: the recording.
-        start, stop: samples. left_out: (N,) samples at which the speed read is known to be false.
+        readings: channel -> (N,).
+        signals: the recording.
+        start: first sample.
+        stop: first sample after the last.
+        left_out: (N,) samples at which the speed read is known to be false.
     """
     rms, spread, squares = {}, {}, []
     for channel in CHANNELS:
@@ -102,7 +119,7 @@ def gap(readings: Mapping[str, Array], signals: Signals, start: int, stop: int,
         known = np.isfinite(measured)
         if channel == "omega" and left_out is not None:
             known = known & ~left_out[start:stop]
-        if known.sum() < 10:
+        if known.sum() < FEWEST:
             continue
         error = np.where(known, readings[channel][start:stop] - measured, np.nan)
         rms[channel] = float(np.sqrt(np.nanmean(error**2)))
@@ -119,7 +136,16 @@ def gap(readings: Mapping[str, Array], signals: Signals, start: int, stop: int,
 
 
 def floor(signals: Signals, start: int, stop: int) -> dict[str, float]:
-    """What the measurement chain alone leaves, RMS by channel: noise, quantisation, and the timing of pulses."""
+    """The gap that the measurement chain alone leaves: noise, quantisation, and the timing of pulses.
+
+    Args:
+        signals: the recording.
+        start: first sample.
+        stop: first sample after the last.
+
+    Returns:
+        Channel -> RMS in SI units.
+    """
     floors = {c: signals.sigma[c] for c in CHANNELS}
     p = signals.pulses
     if p is not None:
@@ -129,12 +155,22 @@ def floor(signals: Signals, start: int, stop: int) -> dict[str, float]:
     return floors
 
 
-def closed(before: Gap, after: Gap, floors: Mapping[str, float], seed: int = 0
-           ) -> tuple[float | None, float | None, float | None]:
-    """Share of the closable gap that closed, its 95 % interval by a block bootstrap; None where nothing was open."""
-    bottom = float(np.sqrt(np.mean([(floors[c] / before.spread[c]) ** 2 for c in before.rms])))
+def closure(before: Gap, after: Gap, floors: Mapping[str, float], seed: int = 0
+            ) -> tuple[float | None, float | None, float | None]:
+    """Share of the closable gap that is closed, with a 95 % interval by a block bootstrap (H. Künsch, 1989).
+
+    Args:
+        before: gap of the nominal model.
+        after: gap of the augmented model, of the same samples.
+        floors: channel -> floor.
+        seed: of the bootstrap.
+
+    Returns:
+        Share, low and high end; None where nothing is open, or for the ends if there are too few windows.
+    """
+    bottom = before.total_floor(floors)
     open_ = before.total - bottom
-    if open_ <= 0.1 * bottom:
+    if open_ <= NOTHING_OPEN * bottom:
         return None, None, None
     share = min((before.total - after.total) / open_, 1.0)
     rng = np.random.default_rng(seed)
@@ -149,14 +185,30 @@ def closed(before: Gap, after: Gap, floors: Mapping[str, float], seed: int = 0
     return share, float(min(low, share)), float(max(high, share))
 
 
-class Scorer:
-    """Measures the gap of models on the held-out part of every recording."""
+class HeldOut:
+    """Measures gaps on the held-out part of every recording.
 
-    def __init__(self, chains: Chains, model: Model, recordings: Sequence[Signals], spikes: bool) -> None:
+    Args:
+        chains: give the values of each recording.
+        model: the nominal model.
+        recordings: of one rig.
+        spikes: whether `speed_spikes` was detected: false captures then do not count.
+    """
+
+    def __init__(self, chains: CutChains, model: Model, recordings: Sequence[Signals], *, spikes: bool) -> None:
         self.chains, self.model, self.recordings, self.spikes = chains, model, recordings, spikes
 
-    def gap(self, readings: Sequence[Mapping[str, Array]], known: bool = True) -> Gap:
-        """The gap over all recordings; `known`: false periods of the speed are told apart if they were found."""
+    def runs(self, values: Mapping[str, float]) -> list[dict[str, Array]]:
+        """Free runs of the model with these values, one a recording."""
+        return [free_run(self.model, s, self.chains.values_of(values, k)) for k, s in enumerate(self.recordings)]
+
+    def gap(self, readings: Sequence[Mapping[str, Array]], *, known: bool = True) -> Gap:
+        """The gap over all recordings.
+
+        Args:
+            readings: of a model, one a recording.
+            known: whether false captures, if detected, are left out.
+        """
         gaps = [gap(r, s, s.train, len(s), s.false_speed if known and self.spikes else None)
                 for r, s in zip(readings, self.recordings, strict=True)]
         if len(gaps) == 1:
@@ -168,21 +220,11 @@ class Scorer:
         windows = np.concatenate([g.windows[:, i] for g, i in zip(gaps, columns, strict=True)])
         return Gap(rms, spread, windows)
 
-    def of(self, values: Mapping[str, float]) -> Gap:
+    def gap_of(self, values: Mapping[str, float]) -> Gap:
         """The gap of the model with these values."""
-        return self.gap([free_run(self.model, s, self.chains.own(values, k))
-                         for k, s in enumerate(self.recordings)])
-
-    def squared(self, values: Mapping[str, float]) -> float:
-        """The squared total gap of the model with these values."""
-        return self.of(values).total ** 2
+        return self.gap(self.runs(values))
 
     def floors(self) -> dict[str, float]:
         """The floor by channel over all recordings."""
         each = [floor(s, s.train, len(s)) for s in self.recordings]
         return {c: math.sqrt(float(np.mean([f[c] ** 2 for f in each]))) for c in CHANNELS}
-
-    @staticmethod
-    def bottom(gap: Gap, floors: Mapping[str, float]) -> float:
-        """The floor of the total gap."""
-        return math.sqrt(float(np.mean([(floors[c] / gap.spread[c]) ** 2 for c in gap.rms])))

@@ -1,48 +1,55 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Everything found and every number fitted together on the whole chain, and how sure each then is."""
+"""The joint fit: all effects found and all parameters together, on the whole chain from the duty to all channels."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis import free_run_gap
-from aeropend_ident.diagnosis.chain.chain import Chain, Chains, difference
-from aeropend_ident.diagnosis.chain.priors import NUMBER_SD, nominal_unknowns
-from aeropend_ident.diagnosis.search.free_curves import shapes
-from aeropend_ident.diagnosis.search.search import Findings, refit
-from aeropend_ident.diagnosis.search.selection import Weighed
-from aeropend_ident.estimation.map_fit import Unknown, fit
-from aeropend_sim.model.effects import CATALOGUE
+from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains, difference
+from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD, nominal_parameters
+from aeropend_ident.diagnosis.chain.values import neutral
+from aeropend_ident.diagnosis.search.findings import Findings, Selection
+from aeropend_ident.diagnosis.search.free_curves import missing_terms
+from aeropend_ident.diagnosis.search.search import refit
+from aeropend_ident.estimation.map_fit import fit
+from aeropend_ident.estimation.parameter import Parameter, started
+from aeropend_ident.signals.statistics import rms
 from aeropend_sim.model.parameters import Model
 
 Array = NDArray[np.float64]
 
 Z95 = 1.959964
+"""Standard deviations of a normal distribution on either side of its mean that hold 95 %."""
 
-PLAIN = 15.0
-"""Log evidence from which on an effect is there in an unknown rig, however unsure its size is."""
+CERTAIN = 15.0
+"""Log evidence above which an effect of an uncalibrated rig is claimed however uncertain its size is: odds of 3·10⁶."""
 
 SURE = 2.5
-"""Standard deviations by which an effect must differ from none, and a number from nominal, after the joint fit."""
+"""Standard deviations by which an effect must differ from none, and a parameter from nominal, after the joint fit.
+
+98.8 % each: some effects are tested in each recording."""
 
 WIDER = 1.2
-"""Factor on the standard deviations of a fit: its inputs are measured too, and quantisation is not white. From rigs
-simulated for the purpose (seeds 11 to 13 of the blind check); intervals are judged on others."""
+"""Factor on the standard deviations of a fit, since its inputs are measured too and quantisation is not white.
+
+Measured: rigs simulated for the purpose (seeds 11 to 13 of `make blind`); intervals are judged on others."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """Tests of what the final fit of a part of the chain leaves.
+    """Tests of what the final fit of a stage leaves.
 
     Attributes:
-        rms: channel -> RMS in units of a reading's noise. white: channel -> share of its samples that are independent.
-        dependence: share of the mean square that curves over inputs and states explain, beyond chance.
-        form: what that is relative to what was explained: by so much the found may be off, relative to its size.
+        rms: channel -> RMS in units of a reading's noise.
+        white: channel -> effective sample size over the number of readings.
+        dependence: share of the mean square that free curves over inputs and states explain, beyond chance.
+        form: RMS that they explain relative to what was explained: the relative error of a size from a wrong form.
     """
 
     rms: dict[str, float]
@@ -52,58 +59,61 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Joint:
-    """What all recordings say of everything found.
+class JointFit:
+    """The joint fit of everything found.
 
     Attributes:
-        values, sd: name -> estimate, standard deviation with what the form of an effect leaves in doubt.
-        checks: part of the chain -> tests of what is left of it.
+        findings: stage -> what is still claimed after it.
+        values: name -> estimate.
+        sd: name -> standard deviation, with the uncertainty from the form of an effect.
+        checks: stage -> tests of what is left of it.
     """
 
+    findings: dict[str, Findings]
     values: dict[str, float]
     sd: dict[str, float]
     checks: dict[str, Check]
 
 
-def settle(chains: Chains, findings: Mapping[str, Findings], random: bool) -> Joint:
-    """Fit all together until each effect that is left is sure enough to be claimed; others leave `findings`.
+def fit_jointly(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool) -> JointFit:
+    """Fit all together until each effect that is left is certain enough to be claimed.
 
     Args:
-        chains, findings: the cut chains, and what was found in each part.
-        random: the arm is moved by a random torque too: what it leaves does not speak against the form of an effect.
+        chains: cut.
+        findings: stage -> what was found.
+        gust: whether `gust` was detected: the rest of the angle then says nothing of the form of an effect.
     """
-    model = chains.model
-    values, sd = _fitted(chains, findings)
-    while weak := _weakest(model, findings, values, sd, fit_nominal=chains.fit_nominal):
-        findings[weak[0]].found.remove(weak[1])
-        values, sd = _fitted(chains, findings)
-    checks = _checks(chains, findings)
+    found = dict(findings)
+    values, sd = _fitted(chains, found)
+    while weak := _least_certain(chains, found, values, sd):
+        stage, selection = weak
+        found[stage] = found[stage].without(selection)
+        values, sd = _fitted(chains, found)
+    checks = _checks(chains, found)
 
     def widened() -> dict[str, float]:
-        formed = {b: c for b, c in checks.items() if b != "arm" or not random}
-        return _widened(chains, findings, values, sd, formed)
+        formed = {b: c for b, c in checks.items() if b != "arm" or not gust}
+        return _widened(chains, found, values, sd, formed)
 
-    while chains.fit_nominal and (weak := _least_needed(model, findings, values, widened())):
-        f = findings[weak[0]]
-        f.found.remove(weak[1])
-        f.final = refit(chains, f.block, f.effects, f.final.values)
-        values, sd = _fitted(chains, findings)
-        checks = _checks(chains, findings)
-    return Joint(values, widened(), checks)
+    while not chains.policy.calibrated and (weak := _least_needed(chains.model, found, values, widened())):
+        stage, selection = weak
+        f = found[stage].without(selection)
+        found[stage] = replace(f, final=refit(chains, stage, f.effects, f.final.values))
+        values, sd = _fitted(chains, found)
+        checks = _checks(chains, found)
+    return JointFit(found, values, widened(), checks)
 
 
-def _fitted(chains: Chains, findings: Mapping[str, Findings]) -> tuple[dict[str, float], dict[str, float]]:
-    """Fit everything found and every number together, on the whole chain from the duty to all channels."""
-    unknowns: dict[str, Unknown] = {}
+def _fitted(chains: CutChains, findings: Mapping[str, Findings]) -> tuple[dict[str, float], dict[str, float]]:
+    """Estimates and standard deviations of everything, fitted on the whole chain."""
+    parameters: dict[str, Parameter] = {}
     start: dict[str, float] = {}
-    for block, f in findings.items():
-        for u in nominal_unknowns(chains, block):
-            unknowns[u.name] = u
-        for h in f.effects:
-            unknowns.update({u.name: u for u in h.starts[0]})
+    for stage, f in findings.items():
+        parameters.update({p.name: p for p in nominal_parameters(chains, stage)})
+        parameters.update({p.name: p for h in f.effects for p in h.own})
         start.update(f.final.values)
 
-    def residuals(chain: Chain, values: Mapping[str, float]) -> dict[str, Array]:
+    def residuals(chain: CutChain, values: Mapping[str, float]) -> dict[str, Array]:
         s = chain.signals.head(chain.signals.train)
         readings = free_run_gap.free_run(chains.model, s, values)
         out: dict[str, Array] = {}
@@ -118,73 +128,65 @@ def _fitted(chains: Chains, findings: Mapping[str, Findings]) -> tuple[dict[str,
             out["omega"] = difference(s.true_speed, readings["omega"]) / s.sigma["omega"]
         return out
 
-    begun = [Unknown(u.name, u.mean, u.sd, u.low, u.high, start.get(u.name, u.start), u.log)
-             for u in unknowns.values()]
-    joint = fit(chains.joined(residuals), begun)
+    joint = fit(chains.joined(residuals), started(parameters.values(), start))
     return joint.values, {name: WIDER * sd for name, sd in joint.sd.items()}
 
 
-def _checks(chains: Chains, findings: Mapping[str, Findings]) -> dict[str, Check]:
-    """Test the residuals of each part for whiteness and for independence of inputs and states."""
+def _checks(chains: CutChains, findings: Mapping[str, Findings]) -> dict[str, Check]:
+    """Test the residuals of each stage for whiteness, and for dependence on inputs and states."""
     checks = {}
-    for block, f in findings.items():
+    for stage, f in findings.items():
         if not f.final.residuals:
             continue
-        own = {u.name for h in f.effects for u in h.starts[0]}
-        known = [u for u in nominal_unknowns(chains, block) if u.name in f.final.values and u.name not in own]
-        best = shapes(chains, block, f.final, known)[0]
+        own = {p.name for h in f.effects for p in h.own}
+        known = [p for p in nominal_parameters(chains, stage) if p.name in f.final.values and p.name not in own]
+        best = missing_terms(chains, stage, f.final, known)[0]
         left = best.explained
         form = math.sqrt(left / max(f.base.mean_square - best.left, left, 1e-12))
-        rms = {c: float(np.sqrt(np.mean(r * r))) for c, r in f.final.residuals.items()}
-        white = {c: f.final.independent[c] / len(r) for c, r in f.final.residuals.items()}
-        checks[block] = Check(rms, white, left / best.before if best.before > 0.0 else 0.0, form)
+        white = {c: f.final.ess[c] / len(r) for c, r in f.final.residuals.items()}
+        checks[stage] = Check({c: rms(r) for c, r in f.final.residuals.items()}, white,
+                              left / best.before if best.before > 0.0 else 0.0, form)
     return checks
 
 
-def _widened(chains: Chains, findings: Mapping[str, Findings], values: Mapping[str, float], sd: Mapping[str, float],
-             checks: Mapping[str, Check]) -> dict[str, float]:
-    """Standard deviations with what the form of an effect leaves in doubt.
+def _widened(chains: CutChains, findings: Mapping[str, Findings], values: Mapping[str, float],
+             sd: Mapping[str, float], checks: Mapping[str, Check]) -> dict[str, float]:
+    """Standard deviations with the uncertainty from the form of an effect.
 
-    A real effect that is not quite of the catalogue's form leaves something that curves at some place still explain.
-    What it may have moved the effect's parameters by is of the size of what is left, relative to what was explained.
+    A true effect of another form leaves a rest that free curves still explain. The error of the effect's parameters is
+    taken as of the same relative size as that rest.
     """
     wider = dict(sd)
-    for block, check in checks.items():
-        for name in {u.name for h in findings[block].effects for u in h.starts[0]}:
+    for stage, check in checks.items():
+        for name in {p.name for h in findings[stage].effects for p in h.own}:
             wider[name] = math.hypot(sd[name], check.form * (values[name] - neutral(chains.model, name)))
     return wider
 
 
-def _weakest(model: Model, findings: Mapping[str, Findings], values: Mapping[str, float], sd: Mapping[str, float], *,
-             fit_nominal: bool = False) -> tuple[str, list[Weighed]] | None:
-    """The finding (block, round) whose size the whole chain leaves least sure, if it is too unsure to be claimed."""
-    sure = []
-    for block, f in findings.items():
-        for round_ in f.found:
-            if fit_nominal and round_[0].gain > PLAIN:
-                continue  # what it does is sure, only not how much of it another of its parameters or a number does
-            size = round_[0].hypothesis.starts[0][0].name
-            spread = max(sd[size], NUMBER_SD * abs(model.model[size]) if size in model.model else 0.0)
-            sure.append((abs(values[size] - neutral(model, size)) / spread, block, round_))
-    worst = min(sure, key=lambda s: s[0], default=None)
+def _least_certain(chains: CutChains, findings: Mapping[str, Findings], values: Mapping[str, float],
+                   sd: Mapping[str, float]) -> tuple[str, Selection] | None:
+    """The finding whose size is least certain, if that is too uncertain to be claimed."""
+    model, certain = chains.model, []
+    for stage, f in findings.items():
+        for selection in f.found:
+            if not chains.policy.calibrated and selection[0].gain > CERTAIN:
+                continue  # its existence is certain; only its size and those of other values cannot be separated
+            size = selection[0].hypothesis.own[0].name
+            spread = max(sd[size], NOMINAL_SD * abs(model.model[size]) if size in model.model else 0.0)
+            certain.append((abs(values[size] - neutral(model, size)) / spread, stage, selection))
+    worst = min(certain, key=lambda c: c[0], default=None)
     return worst[1:] if worst is not None and worst[0] < SURE else None
 
 
-def _least_needed(model: Model, findings: Mapping[str, Findings], values: Mapping[str, float], sd: Mapping[str, float]
-                  ) -> tuple[str, list[Weighed]] | None:
-    """The finding besides the main one whose size may as well be none, given what the form of all leaves in doubt."""
-    rounds = [(block, round_) for block, f in findings.items() for round_ in f.found]
-    main = max((round_[0].gain for _, round_ in rounds), default=0.0)
-    sure = []
-    for block, round_ in rounds:
-        size = round_[0].hypothesis.starts[0][0].name
-        if round_[0].gain < main:
-            sure.append((abs(values[size] - neutral(model, size)) / max(sd[size], 1e-300), block, round_))
-    least = min(sure, key=lambda s: s[0], default=None)
+def _least_needed(model: Model, findings: Mapping[str, Findings], values: Mapping[str, float],
+                  sd: Mapping[str, float]) -> tuple[str, Selection] | None:
+    """The finding besides the main one whose size is consistent with zero, given the uncertainty from forms."""
+    found = [(stage, selection) for stage, f in findings.items() for selection in f.found]
+    main = max((selection[0].gain for _, selection in found), default=0.0)
+    certain = []
+    for stage, selection in found:
+        size = selection[0].hypothesis.own[0].name
+        if selection[0].gain < main:
+            certain.append((abs(values[size] - neutral(model, size)) / max(sd[size], 1e-300), stage, selection))
+    least = min(certain, key=lambda c: c[0], default=None)
     return least[1:] if least is not None and least[0] < Z95 else None
-
-
-def neutral(model: Model, name: str) -> float:
-    """The value at which something found is absent."""
-    owner, _, parameter = name.partition(".")
-    return CATALOGUE[owner].parameters[parameter].neutral if parameter else model.model[owner]

@@ -1,29 +1,71 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where: the share of each part of the chain in the gap, and the region of operation in which it arises."""
+"""Where the gap arises: the share of each place of the chain, and the ranges of operation."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis.chain.chain import BLOCKS, Chains
+from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.values import STAGES
 from aeropend_ident.diagnosis.search import gust
-from aeropend_ident.diagnosis.search.search import Findings
+from aeropend_ident.diagnosis.search.findings import Findings
 from aeropend_ident.estimation.map_fit import Fit
 from aeropend_sim.model.effects import PLACES
 
 Array = NDArray[np.float64]
 
 BINS = 12
+"""Ranges into which a variable is divided, by quantiles (choice)."""
+
 NOTEWORTHY = 0.15
-"""A region is named when its share of the misfit exceeds its share of the time by this much."""
+"""Excess of a region's share of the misfit over its share of the time above which it is reported (choice)."""
+
+MOST = 3
+"""Regions that are reported at most (choice)."""
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """The misfit of the nominal structure where it is largest.
+
+    Attributes:
+        signal: (M,) the misfit of a voltage, a current, or the torque on the arm that would cause that of the angle.
+        variables: name -> (M,) the variables beside it.
+    """
+
+    signal: Array
+    variables: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class Region:
+    """A range of a variable in which the misfit concentrates.
+
+    Attributes:
+        variable: its name.
+        low: lower end.
+        high: upper end.
+        share: of the squared misfit.
+        time: share of the time.
+    """
+
+    variable: str
+    low: float
+    high: float
+    share: float
+    time: float
 
 
 def shares(amounts: Iterable[tuple[str, float]]) -> dict[str, float]:
-    """Share of each place, from amounts of squared gap by place: what comes back when a finding is taken out again."""
+    """Share of each place in the gap.
+
+    Args:
+        amounts: place and squared gap, which comes back when a finding is taken out again.
+    """
     total = dict.fromkeys(PLACES, 0.0)
     for place, amount in amounts:
         total[place] += amount
@@ -31,43 +73,39 @@ def shares(amounts: Iterable[tuple[str, float]]) -> dict[str, float]:
     return {place: (x / everything if everything > 0.0 else 0.0) for place, x in total.items()}
 
 
-def misfit_signal(chains: Chains, findings: Mapping[str, Findings]) -> tuple[Array, dict[str, Array]]:
-    """What the part that explains least leaves of its signal, and what regions may be drawn in, each (M,)."""
-    block = max(BLOCKS, key=lambda b: _worst(findings[b].base))
+def largest_misfit(chains: CutChains, findings: Mapping[str, Findings]) -> Misfit:
+    """The misfit of the stage that the nominal structure fits worst, in the first recording."""
+    stage = max(STAGES, key=lambda b: _worst(findings[b].base))
     chain, arm = chains.each[0], findings["arm"]
     s = chain.signals
-    if block == "actuator":
-        misfit, index = s.v_a - chain.actuator(chains.own(arm.final.values, 0)), np.arange(len(s))
-    elif block == "motor":
-        misfit = s.i_a - chain.motor(chains.own(findings["motor"].base.values, 0))[0]
+    if stage == "actuator":
+        misfit, index = s.v_a - chain.actuator(chains.values_of(arm.final.values, 0)), np.arange(len(s))
+    elif stage == "motor":
+        misfit = s.i_a - chain.motor(chains.values_of(findings["motor"].base.values, 0))[0]
         index = np.arange(len(s))
     else:
-        g = gust.tracked(chains, arm.final, arm.base)
+        g = gust.track(chains, arm.final, arm.base)
         misfit, index = g.torque, g.index
-    theta = gust.angle(chains, s)
-    rate = np.gradient(gust.calm(theta), s.period)
-    seen = theta if chains.fit_nominal else s.theta
+    theta = gust.filled_angle(chains, s)
+    rate = np.gradient(gust.smoothed_angle(theta), s.period)
+    seen = s.theta if chains.policy.calibrated else theta
     variables: dict[str, Array] = {"theta": seen[index], "theta_dot": rate[index], "omega": chain.speed[index],
                  "i_a": s.i_a[index], "duty": s.duty[index], "t": np.asarray(index * s.period, dtype=float)}
-    return misfit[: len(index)], variables
+    return Misfit(misfit[: len(index)], variables)
 
 
-def regions(misfit: Array, variables: Mapping[str, Array], most: int = 3) -> list[dict[str, Any]]:
-    """The ranges of each variable in which the misfit concentrates, most concentrated first.
+def regions(misfit: Misfit, most: int = MOST) -> list[Region]:
+    """The ranges of each variable in which the misfit concentrates, the most concentrated first.
 
     Args:
-        misfit: (M,) any measure with sign; its square is what is shared out.
-        variables: name -> (M,).
-        most: how many at most.
-
-    Returns:
-        variable, low, high, share of the squared misfit, and share of the time.
+        misfit: its square is divided among the ranges.
+        most: number of regions at most.
     """
-    energy = np.nan_to_num(misfit) ** 2
+    energy = np.nan_to_num(misfit.signal) ** 2
     if energy.sum() <= 0.0:
         return []
-    found: list[dict[str, Any]] = []
-    for name, x in variables.items():
+    found: list[Region] = []
+    for name, x in misfit.variables.items():
         known = np.isfinite(x)
         if known.sum() <= BINS:
             continue
@@ -79,14 +117,14 @@ def regions(misfit: Array, variables: Mapping[str, Array], most: int = 3) -> lis
         share = share / max(share.sum(), 1e-300)
         time = np.bincount(which, minlength=len(edges) - 1) / known.sum()
         a, b = _best_run(share - time)
-        found.append({"variable": name, "low": float(edges[a]), "high": float(edges[b + 1]),
-                      "share": float(share[a:b + 1].sum()), "time": float(time[a:b + 1].sum())})
-    found.sort(key=lambda r: r["time"] - r["share"])
-    return [r for r in found if r["share"] - r["time"] > NOTEWORTHY][:most]
+        found.append(Region(name, float(edges[a]), float(edges[b + 1]), float(share[a:b + 1].sum()),
+                            float(time[a:b + 1].sum())))
+    found.sort(key=lambda r: r.time - r.share)
+    return [r for r in found if r.share - r.time > NOTEWORTHY][:most]
 
 
 def _best_run(x: Array) -> tuple[int, int]:
-    """First and last index of the contiguous run with the largest sum (Kadane)."""
+    """First and last index of the contiguous run of x (N,) with the largest sum (Kadane's algorithm)."""
     best, at, total, start = -np.inf, (0, 0), 0.0, 0
     for j, value in enumerate(x):
         if total <= 0.0:

@@ -1,63 +1,56 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fit a hypothesis to a block of channels, numbers and effects together, and weigh it against others.
+"""Maximum a posteriori (MAP) fit of a model to channels of residuals, and its log evidence.
 
-Every number of the model carries a prior, so that it cannot wander off to cover for a missing effect. A residual that
-is larger than the noise or coloured counts for less: the standard deviation is inflated to what is seen and the samples
-are thinned to as many as are independent. So a wrong hypothesis cannot buy a precise fit with absurd numbers, and the
-right one, whose residual is white and as small as the noise, is weighed in full.
+With residuals r_c (in units of a reading's noise) of channels c, and parameters z in standard units, the fit minimises
+
+    sum_c  (ess_c / n_c) * sum(r_c ** 2) / s_c ** 2  +  sum(z ** 2)
+
+- s_c >= 1 inflates the noise to the RMS of the residual: a model that does not fit cannot claim a precise fit.
+- ess_c <= n_c is the effective sample size: a coloured residual holds less information than its samples.
+- The prior (z standard normal) keeps parameters from moving far to stand in for a missing effect.
+
+Both weights are renewed as the fit goes on. Fits are compared by their log evidence in Laplace's approximation: log
+likelihood, log prior, and log Occam factor (D. MacKay, Information Theory, Inference, and Learning Algorithms, 2003,
+chapter 28).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft, next_fast_len, rfft
+
+from aeropend_ident.estimation.parameter import Parameter, key, started
+from aeropend_ident.signals.statistics import effective_sample_size
 
 Array = NDArray[np.float64]
 Residuals = Mapping[str, Array]
-"""Channel -> residual in units of its standard deviation, missing samples left out."""
+"""Channel -> residual (N,) in units of a reading's noise, missing samples left out."""
 Products = dict[str, tuple[NDArray[np.intp], Array]]
-"""Channel -> the unknowns (U,) that change it, and their slopes' products (U, U), summed over its samples."""
+"""Channel -> indices (P,) of the parameters that change it, and the products (P, P) of their sensitivities."""
 
-STRAGGLERS = 0.1
-"""Share of the channels whose weights may still change when a fit ends: of many recordings there is always one."""
+MAY_CHANGE = 0.1
+"""Share of the channels whose weights may still change when a fit ends (choice).
 
+With many recordings some channel always changes a little."""
 
-@dataclass(frozen=True)
-class Unknown:
-    """A number to be fitted.
+WEIGHT_CHANGE = 0.02
+"""Relative change of a channel's weight that counts as a change (choice)."""
 
-    Attributes:
-        name: of the number; `x@k` is the x of the channels that end in `@k`.
-        mean, sd: of its prior, which is normal, or log-normal if `log` (then sd is that of the logarithm and mean, low
-            and high are positive).
-        low, high: bounds. start: where the search starts; the mean by default.
-    """
+STEP = 1e-4
+"""Step of the finite differences, in standard deviations of the prior: well above rounding, well below curvature."""
 
-    name: str
-    mean: float
-    sd: float
-    low: float = -np.inf
-    high: float = np.inf
-    start: float | None = None
-    log: bool = False
+DAMPING, DAMPING_DOWN, DAMPING_UP, MOST_DAMPING = 1e-3, 0.2, 8.0, 1e6
+"""Levenberg-Marquardt damping: first value, factors after a step that succeeds and one that fails, and where it ends.
 
-    def to_standard(self, value: float) -> float:
-        """The value as a standard normal number."""
-        if self.log:
-            return (np.log(value) - np.log(self.mean)) / self.sd if value > 0.0 else -np.inf
-        return (value - self.mean) / self.sd
+Choice; any factors from 0.1 and 10 on lead to the same minimum."""
 
-    def value(self, z: float) -> float:
-        """The inverse of `to_standard`."""
-        return float(self.mean * np.exp(self.sd * z)) if self.log else float(self.mean + self.sd * z)
+ENOUGH, ENOUGH_OF_EXCESS = 1e-2, 1e-4
+"""Decrease of the cost below which the search stops: absolute, and relative to the cost above that of noise.
 
-    def slope(self, z: float) -> float:
-        """D value / d z."""
-        return self.value(z) * self.sd if self.log else self.sd
+The cost is twice a log density: 0.01 is a hundredth of what tells two hypotheses apart."""
 
 
 @dataclass(frozen=True)
@@ -66,119 +59,126 @@ class Fit:
 
     Attributes:
         values: name -> estimate.
-        sd: name -> standard deviation.
-        residuals: channel -> (N,) in units of the noise, at the estimate.
+        sd: name -> standard deviation of the estimate.
+        residuals: channel -> (N,) in units of a reading's noise, at the estimate.
         scale: channel -> RMS of the residual, at least 1.
-        independent: channel -> number of independent samples.
-        prior: log density of the estimate under the prior.
-        slopes: products of the slopes of each channel.
+        ess: channel -> effective sample size of the residual.
+        log_prior: log density of the estimate under the prior, up to a constant.
+        products: products of the sensitivities of each channel.
     """
 
     values: dict[str, float]
     sd: dict[str, float]
     residuals: dict[str, Array]
     scale: dict[str, float]
-    independent: dict[str, float]
-    prior: float
-    slopes: Products
+    ess: dict[str, float]
+    log_prior: float
+    products: Products
 
     @property
     def mean_square(self) -> float:
         """Mean square residual over all channels, in units of a reading's noise."""
         return float(np.mean(np.concatenate(list(self.residuals.values())) ** 2))
 
-    def evidence(self, independent: Mapping[str, float]) -> float:
-        """Log evidence of the hypothesis when a channel counts as so many independent samples."""
-        return self.likelihood(independent) + self.simplicity(independent)
+    def log_evidence(self, ess: Mapping[str, float]) -> float:
+        """Log evidence in Laplace's approximation.
 
-    def likelihood(self, independent: Mapping[str, float]) -> float:
-        """What of the evidence is the misfit."""
+        Args:
+            ess: channel -> effective sample size; the same for all fits that are compared.
+        """
+        return self.log_likelihood(ess) + self.log_occam(ess)
+
+    def log_likelihood(self, ess: Mapping[str, float]) -> float:
+        """Log likelihood, normal with the inflated noise; `ess` as in `log_evidence`."""
         total = 0.0
         for channel, r in self.residuals.items():
             s2 = self.scale[channel] ** 2
-            total -= 0.5 * independent[channel] * (np.log(s2) + float(np.mean(r * r)) / s2)
+            total -= 0.5 * ess[channel] * (np.log(s2) + float(np.mean(r * r)) / s2)
         return total
 
-    def simplicity(self, independent: Mapping[str, float]) -> float:
-        """What of it is the prior, less what the data's precision costs (Laplace)."""
+    def log_occam(self, ess: Mapping[str, float]) -> float:
+        """Log Occam factor: prior density at the estimate times posterior volume; `ess` as in `log_evidence`."""
         information = np.eye(len(self.values))
-        for channel, (by, products) in self.slopes.items():
-            weight = independent[channel] / len(self.residuals[channel]) / self.scale[channel] ** 2
+        for channel, (by, products) in self.products.items():
+            weight = ess[channel] / len(self.residuals[channel]) / self.scale[channel] ** 2
             information[np.ix_(by, by)] += weight * products
-        return self.prior - 0.5 * float(np.linalg.slogdet(information)[1])
+        return self.log_prior - 0.5 * float(np.linalg.slogdet(information)[1])
 
 
-def independent_samples(r: Array, power: int = 1) -> float:
-    """How many independent samples a residual (N,) is worth: N over its integrated autocorrelation time.
+def estimate(values: dict[str, float], sd: dict[str, float]) -> Fit:
+    """A fit that was not made by `fit`: estimates and standard deviations alone."""
+    return Fit(values, sd, {}, {}, {}, 0.0, {})
 
-    Args:
-        r: the residual. power: 2 asks it of the mean square, whose scatter autocorrelations of either sign widen alike,
-            those of a narrow band included.
+
+def largest_ess(fits: Iterable[Fit]) -> dict[str, float]:
+    """Channel -> effective sample size for a comparison of fits: that of the whitest residual."""
+    ess: dict[str, float] = {}
+    for f in fits:
+        for channel, n in f.ess.items():
+            ess[channel] = max(ess.get(channel, 0.0), n)
+    return ess
+
+
+class Sensitivities:
+    """Derivatives of one channel's residual (N,).
+
+    Attributes:
+        by: (P,) indices of the parameters that change it.
+        rows: (P, N) derivatives.
     """
-    n = len(r)
-    if n < 16:
-        return float(n)
-    size = next_fast_len(2 * n, real=True)
-    correlation = irfft(np.abs(rfft(r, size)) ** 2, size)[: n // 4]
-    if correlation[0] <= 0.0:
-        return float(n)
-    correlation = correlation / correlation[0]
-    running = 1.0 + 2.0 * np.cumsum(correlation[1:] ** power)
-    # Sokal's window: stop where the lag exceeds five times the time found so far
-    lags = np.arange(1, len(correlation))
-    stop = np.flatnonzero(lags >= 5.0 * running)
-    time = running[stop[0]] if len(stop) else running[-1]
-    return float(n / max(time, 1.0))
-
-
-class Slopes:
-    """Derivatives of one channel's residual (N,): `by`: the unknowns that change it; `rows`: (len(by), N)."""
 
     def __init__(self, by: NDArray[np.intp], n: int) -> None:
         self.by, self.rows = by, np.empty((len(by), n))
 
 
 class Search:
-    """A point in the space of the unknowns, in standard units, with its residuals and their weights."""
+    """A point in the space of the parameters, in standard units, with its residuals and their weights.
 
-    def __init__(self, residuals: Callable[[dict[str, float]], Residuals], unknowns: Sequence[Unknown],
-                 least: float = 0.0) -> None:
-        self.residuals, self.unknowns, self.least = residuals, tuple(unknowns), least
-        self.low = np.array([u.to_standard(u.low) for u in unknowns])
-        self.high = np.array([u.to_standard(u.high) for u in unknowns])
-        self.z = np.array([u.to_standard(u.mean if u.start is None else u.start) for u in unknowns])
+    Args:
+        residuals: values by name -> residuals in units of a reading's noise.
+        parameters: to be fitted.
+        least_ess: effective sample size that a channel counts for at least.
+    """
+
+    def __init__(self, residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter],
+                 least_ess: float = 0.0) -> None:
+        self.residuals, self.parameters, self.least_ess = residuals, tuple(parameters), least_ess
+        self.low = np.array([p.to_standard(p.low) for p in parameters])
+        self.high = np.array([p.to_standard(p.high) for p in parameters])
+        self.z = np.array([p.to_standard(p.begin) for p in parameters])
         self.z = np.clip(self.z, self.low, self.high)
         self.current = self.at(self.z)
         self.renew_weights()
 
     def at(self, z: Array) -> dict[str, Array]:
-        """Residuals at a point in standard units."""
-        values = {u.name: u.value(x) for u, x in zip(self.unknowns, z, strict=True)}
+        """Residuals at a point z (P,) in standard units."""
+        values = {p.name: p.value(x) for p, x in zip(self.parameters, z, strict=True)}
         return {k: np.asarray(r) for k, r in self.residuals(values).items() if len(r)}
 
     def renew_weights(self) -> None:
-        """Inflate the noise and thin the samples to what the residuals at this point show."""
+        """Set noise inflation and effective sample size to those of the residuals at this point."""
         self.scale = {k: max(1.0, float(np.sqrt(np.mean(r * r)))) for k, r in self.current.items()}
-        self.independent = {k: independent_samples(r) for k, r in self.current.items()}
-        self.weight = {k: np.sqrt(min(max(self.independent[k], self.least) / len(r), 1.0)) / self.scale[k]
+        self.ess = {k: effective_sample_size(r) for k, r in self.current.items()}
+        self.weight = {k: np.sqrt(min(max(self.ess[k], self.least_ess) / len(r), 1.0)) / self.scale[k]
                        for k, r in self.current.items()}
 
     def stack(self, residuals: Residuals) -> Array:
         """Weighted residuals of all channels as one vector."""
         return np.concatenate([self.weight[k] * residuals[k] for k in self.weight] or [np.zeros(0)])
 
-    def jacobian(self, step: float = 1e-4) -> dict[str, Slopes]:
-        """Derivatives of the weighted residuals, by differences towards the inside of the bounds.
+    def jacobian(self, step: float = STEP) -> dict[str, Sensitivities]:
+        """Derivatives of the weighted residuals, by finite differences towards the inside of the bounds.
 
-        What each of several recordings has its own of is moved in all of them at once.
+        A parameter of which each recording has its own is moved in all recordings at once.
         """
         moves = np.where(self.z + step > self.high, -step, step)
-        groups: dict[str, dict[str, int]] = {}
-        for j, u in enumerate(self.unknowns):
-            name, _, recording = u.name.partition("@")
-            groups.setdefault(name, {})[recording] = j
-        by = {k: [g.get(k.partition("@")[2], g.get("", -1)) for g in groups.values()] for k in self.weight}
-        slopes = {k: Slopes(np.array([j for j in by[k] if j >= 0], int), len(self.current[k])) for k in self.weight}
+        groups: dict[str, dict[int, int]] = {}
+        for j, p in enumerate(self.parameters):
+            name = key(p.name)
+            groups.setdefault(name.plain, {})[name.recording] = j
+        by = {k: [g.get(key(k).recording, g.get(0, -1)) for g in groups.values()] for k in self.weight}
+        slopes = {k: Sensitivities(np.array([j for j in by[k] if j >= 0], int), len(self.current[k]))
+                  for k in self.weight}
         filled = dict.fromkeys(slopes, 0)
         for at, group in enumerate(groups.values()):
             z = self.z.copy()
@@ -190,16 +190,16 @@ class Search:
                     filled[k] += 1
         return slopes
 
-    def stacked(self, slopes: Mapping[str, Slopes]) -> Array:
-        """The slopes of all channels as one matrix, one row an unknown."""
+    def stacked(self, slopes: Mapping[str, Sensitivities]) -> Array:
+        """The derivatives of all channels as one matrix, one row a parameter."""
         out, at = np.zeros((len(self.z), sum(s.rows.shape[1] for s in slopes.values()))), 0
         for s in slopes.values():
             out[s.by, at:at + s.rows.shape[1]] = s.rows
             at += s.rows.shape[1]
         return out
 
-    def normal(self, slopes: Mapping[str, Slopes]) -> tuple[Array, Array, Products]:
-        """The information matrix and the gradient of half the cost, prior included; and what `Fit.slopes` keeps."""
+    def normal_equations(self, slopes: Mapping[str, Sensitivities]) -> tuple[Array, Array, Products]:
+        """Information matrix (P, P) and gradient (P,) of half the cost, prior included; and what `Fit` keeps."""
         information, gradient = np.eye(len(self.z)), self.z.copy()
         products: dict[str, tuple[NDArray[np.intp], Array]] = {}
         for k, s in slopes.items():
@@ -210,15 +210,22 @@ class Search:
         return information, gradient, products
 
     def improve(self, steps: int) -> tuple[Array, Products]:
-        """Levenberg-Marquardt steps with the weights as they are; returns the last `normal` but for its gradient."""
-        damping = 1e-3
+        """Take Levenberg-Marquardt steps with the weights as they are.
+
+        Args:
+            steps: at most.
+
+        Returns:
+            Information matrix and products of the last `normal_equations`.
+        """
+        damping = DAMPING
         information, products = np.eye(len(self.z)), Products()
         for _ in range(steps):
             r = self.stack(self.current)
-            information, gradient, products = self.normal(self.jacobian())
+            information, gradient, products = self.normal_equations(self.jacobian())
             cost = float(r @ r + self.z @ self.z)
             gained = 0.0
-            while damping < 1e6:
+            while damping < MOST_DAMPING:
                 step = np.linalg.solve(information + damping * np.diag(np.diag(information)), -gradient)
                 z = np.clip(self.z + step, self.low, self.high)
                 trial = self.at(z)
@@ -227,60 +234,63 @@ class Search:
                 if np.isfinite(new) and new < cost:
                     gained = cost - new
                     self.z, self.current = z, trial
-                    damping *= 0.2
+                    damping *= DAMPING_DOWN
                     break
-                damping *= 8.0
-            if gained < 1e-2 + 1e-4 * max(cost - sum(self.independent.values()), 0.0):
+                damping *= DAMPING_UP
+            if gained < ENOUGH + ENOUGH_OF_EXCESS * max(cost - sum(self.ess.values()), 0.0):
                 break
         return information, products
 
 
-def fit(residuals: Callable[[dict[str, float]], Residuals], unknowns: Sequence[Unknown],
-        rounds: int = 10, steps: int = 4, least: float = 0.0) -> Fit:
-    """Maximum a posteriori fit with the noise inflated to what the residual shows.
+def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter],
+        rounds: int = 10, steps: int = 4, least_ess: float = 0.0) -> Fit:
+    """MAP fit with the noise inflated to the residual; see the module.
 
     Args:
-        residuals: values by name -> residuals in units of the noise.
-        unknowns: what is fitted.
-        rounds: how often the weights are renewed at most; steps: Levenberg-Marquardt steps in each.
-        least: samples that a channel counts for at least while the search goes on. A slow drift, which is worth a few,
-            would not pull numbers and sizes from where a wide prior has its middle.
+        residuals: values by name -> residuals in units of a reading's noise.
+        parameters: to be fitted.
+        rounds: how often the weights are renewed at most.
+        steps: Levenberg-Marquardt steps in each round.
+        least_ess: effective sample size that a channel counts for at least during the search. A slow drift has a small
+            one; with wide priors the search would then stay near their means.
     """
-    search = Search(residuals, unknowns, least)
+    search = Search(residuals, parameters, least_ess)
     information, products = np.eye(len(search.z)), Products()
     for _ in range(rounds):
         information, products = search.improve(steps)
         before = search.weight
         search.renew_weights()
-        if sum(abs(search.weight[k] - before[k]) >= 0.02 * before[k] for k in before) <= STRAGGLERS * len(before):
+        changed = sum(abs(search.weight[k] - before[k]) >= WEIGHT_CHANGE * before[k] for k in before)
+        if changed <= MAY_CHANGE * len(before):
             break
     z, covariance = search.z, np.linalg.inv(information)
-    values = {u.name: u.value(x) for u, x in zip(unknowns, z, strict=True)}
-    sd = {u.name: abs(u.slope(x)) * float(np.sqrt(v)) for u, x, v in zip(unknowns, z, np.diag(covariance), strict=True)}
-    return Fit(values, sd, search.current, search.scale, search.independent, -0.5 * float(z @ z), products)
+    values = {p.name: p.value(x) for p, x in zip(parameters, z, strict=True)}
+    sd = {p.name: abs(p.slope(x)) * float(np.sqrt(v)) for p, x, v in zip(parameters, z, np.diag(covariance),
+                                                                         strict=True)}
+    return Fit(values, sd, search.current, search.scale, search.ess, -0.5 * float(z @ z), products)
 
 
-def screen(residuals: Callable[[dict[str, float]], Residuals], base: Fit, known: Sequence[Unknown],
-           additions: Sequence[Sequence[Unknown]]) -> list[float]:
-    """How much of the misfit each addition would take away if everything were linear, by one least-squares solve each.
+def screen(residuals: Callable[[dict[str, float]], Residuals], base: Fit, known: Sequence[Parameter],
+           additions: Sequence[Sequence[Parameter]]) -> list[float]:
+    """Share of the misfit that each addition would leave if the model were linear: one least-squares solve each.
 
     Args:
         residuals: as for `fit`.
-        base: the fit without additions, over `known`.
-        known: its unknowns.
-        additions: groups of unknowns, each tried at its starts.
+        base: the fit without additions.
+        known: its parameters.
+        additions: groups of parameters, each tried at its starts.
 
     Returns:
         Share of the weighted sum of squares that is left, one an addition; 1 where nothing changes.
     """
-    search = Search(residuals, [replace(u, start=base.values[u.name]) for u in known])
+    search = Search(residuals, started(known, base.values))
     r = search.stack(search.current)
     slopes = search.jacobian()
-    information, gradient, _ = search.normal(slopes)
+    information, gradient, _ = search.normal_equations(slopes)
     cost = float(r @ r + search.z @ search.z)
     left = []
     for group in additions:
-        values = {**base.values, **{u.name: u.mean if u.start is None else u.start for u in group}}
+        values = {**base.values, **{p.name: p.begin for p in group}}
         changed = {k: np.asarray(x) for k, x in residuals(values).items() if len(x)}
         column = search.stack({k: changed[k] for k in search.weight}) - r
         size = float(column @ column)
@@ -291,6 +301,7 @@ def screen(residuals: Callable[[dict[str, float]], Residuals], base: Fit, known:
         for s in slopes.values():
             cross[s.by] += s.rows @ column[at:at + s.rows.shape[1]]
             at += s.rows.shape[1]
+        # a little ridge keeps the matrix regular where a known parameter does the same
         bordered = np.block([[information, cross[:, None]], [cross, (1.0 + 1e-9) * size]])
         right = np.append(gradient, column @ r)
         left.append(max(cost - float(right @ np.linalg.solve(bordered, right)), 0.0) / max(cost, 1e-300))

@@ -15,12 +15,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aeropend_ident.bags.recording import Recording, RecordingError, holds
-from aeropend_ident.diagnosis.chain.chain import structure
 from aeropend_ident.identification.output_error import Means, Output
 from aeropend_ident.identification.terms import Array
 from aeropend_ident.signals.derivatives import noise_of, smoothed, smoothness
-from aeropend_ident.signals.signals import CHANNELS, MINIMUM_DURATION, Signals, from_recording
+from aeropend_ident.signals.from_bag import from_recording
+from aeropend_ident.signals.signals import CHANNELS, MINIMUM_DURATION, Signals
 from aeropend_ident.signals.signals import from_arrays as signals_from_arrays
+from aeropend_ident.signals.smoothing import slow_part
 
 STATES = ("theta", "theta_dot", "i_a", "omega")
 INPUTS = ("v_a", "duty")
@@ -246,7 +247,7 @@ def _held_voltage(v: Array, duty: Array, sigma: float, period: float) -> Array:
     """The voltage (N,) without its noise: its mean while the duty is held, and what varies slowly beside it."""
     start, length = holds(duty)
     mean = np.repeat(np.add.reduceat(v, start) / length, length)
-    return np.asarray(mean + structure(v - mean, round(0.05 / period), sigma))
+    return np.asarray(mean + slow_part(v - mean, round(0.05 / period), sigma))
 
 
 def with_train(data: Dataset, held_out: float) -> Dataset:

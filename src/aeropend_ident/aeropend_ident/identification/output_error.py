@@ -398,14 +398,14 @@ class Fitter:
 
     def reweigh(self, residuals: dict[str, list[Array]], *, coloured: bool = True) -> None:
         """Take the size of each channel's noise, and how coloured it is, from its residuals."""
-        from aeropend_ident.estimation.map_fit import independent_samples
+        from aeropend_ident.signals.statistics import effective_sample_size
 
         for name, shots in residuals.items():
             r = np.concatenate(shots)
             if len(r) == 0:
                 continue
             self.scale[name] = max(float(np.sqrt(np.mean(r * r))), self.floor, 1e-300)
-            self.inflation[name] = max(1.0, len(r) / independent_samples(r), slow_share(r)) if coloured else 1.0
+            self.inflation[name] = max(1.0, len(r) / effective_sample_size(r), slow_share(r)) if coloured else 1.0
 
     # --- linearised
 

@@ -6,11 +6,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.estimation.map_fit import independent_samples
 from aeropend_ident.identification.subset_selection import Sums, select
 from aeropend_ident.identification.terms import Array, Library
 from aeropend_ident.identification.weak import BLOCKS
 from aeropend_ident.signals.derivatives import smoothed, smoothness, tv_derivative
+from aeropend_ident.signals.statistics import effective_sample_size
 
 DERIVATIVES = ("smoothed", "tv")
 
@@ -52,7 +52,7 @@ class Regression:
         y = self.left[:, equation] - known
         share = 1.0
         if coefficients is not None:
-            share = independent_samples((y - self.terms @ coefficients)[self.use]) / len(self.use)
+            share = effective_sample_size((y - self.terms @ coefficients)[self.use]) / len(self.use)
         parts = np.array_split(self.use, BLOCKS)
         return [Sums.of(self.terms[p], y[p], known[p]).times(share) for p in parts]
 

@@ -1,76 +1,136 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag as signals for the diagnosis, or one line that says why nothing can be told from it."""
+"""A bag as signals: read, cut at pauses, put on a grid, cleaned.
+
+Of a calibrated rig the model file states the measurement chain, and the stamps must keep the sample period. Of an
+uncalibrated rig noise and resolution are estimated from the recording, stamps may be irregular, and the command may be
+missing.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from aeropend_ident.bags import recording
-from aeropend_ident.bags.recording import OFF_GRID, Recording, RecordingError
-from aeropend_ident.signals import uncalibrated
-from aeropend_ident.signals.signals import Signals, from_recording
+from aeropend_ident.bags.recording import Recording, RecordingError
+from aeropend_ident.signals.free_decay import degrees, free_decay
+from aeropend_ident.signals.grid import check_period, irregular_grid, longest_piece, regular_grid
+from aeropend_ident.signals.noise import reading_noise_at
+from aeropend_ident.signals.signals import CHANNELS, STILL, Signals, from_arrays
 
-PAUSE = 10.0
-"""s without a sample after which what came before says nothing about what comes next."""
+FEWEST = 30
+"""Samples of an uncalibrated rig below which there is no verdict (choice)."""
 
-MINIMUM = 30
-"""Samples of an unknown rig below which nothing is said."""
+LONGEST_PERIOD = 5e-3
+"""[s] Longest period of the grid on which a command acts; the angle may be read at a lower rate.
 
-IRREGULAR = 0.05
-"""Share of steps between stamps that may fit no sample period."""
+Choice: a command that is late by half of it moves the arm by less than a reading's noise."""
+
+MOVES = 3.0
+"""Standard deviations of a reading that a channel must vary by to show that the motor runs (choice)."""
 
 
 def signals_of(bag: str | Path, namespace: str | None, sensing: Mapping[str, float], held_out: float = 0.3, *,
                fit_nominal: bool = False) -> Signals:
-    """Read a bag.
+    """Read a bag as signals.
 
     Args:
-        bag, namespace: as for `recording.read`.
-        sensing: the model's measurement chain.
+        bag: folder or file; see `recording.read`.
+        namespace: of the rig, if the bag holds several.
+        sensing: parameters of the model's measurement chain.
         held_out: share of the recording at its end that models are not fitted to.
-        fit_nominal: nobody knows the rig's numbers, nor its measurement chain; the command may be missing.
+        fit_nominal: whether the rig is uncalibrated.
 
     Raises:
-        RecordingError: nothing can be told from it; one line that says why.
+        RecordingError: no verdict is possible; one line that says why.
     """
     read = recording.read(bag, namespace)
-    if fit_nominal:
-        if len(read) < MINIMUM:
-            raise RecordingError(f"{read.path}: {len(read)} samples are too few for a verdict")
-        return uncalibrated.signals_from(_longest_piece(read), sensing, held_out)
-    _check_grid(read)
-    return from_recording(_longest_piece(read), sensing, held_out)
-
-
-def _check_grid(read: Recording) -> None:
-    if len(read) < 3:
+    if not fit_nominal:
+        check_period(read)
+        return from_recording(longest_piece(read), sensing, held_out)
+    if len(read) < FEWEST:
         raise RecordingError(f"{read.path}: {len(read)} samples are too few for a verdict")
-    steps = np.diff(read.stamp_ns)
-    periods = steps / np.median(steps)
-    share = float(np.mean(np.abs(periods - np.maximum(np.rint(periods), 1.0)) > OFF_GRID))
-    if share > IRREGULAR:
-        raise RecordingError(f"{read.path}: {100.0 * share:.0f} % of the steps between its stamps fit no sample period "
-                             "(a clock that was set while recording, or two rigs on one topic), so no verdict is "
-                             "possible; record again")
+    return from_uncalibrated(longest_piece(read), sensing, held_out)
 
 
-def _longest_piece(read: Recording) -> Recording:
-    """The longest part without a pause, with a note; the recording itself where it never pauses."""
-    pauses = np.flatnonzero(np.diff(read.stamp_ns) > PAUSE * 1e9)
-    if not len(pauses):
-        return read
-    first, last = np.append(0, pauses + 1), np.append(pauses, len(read) - 1)
-    longest = int(np.argmax(read.stamp_ns[last] - read.stamp_ns[first]))
-    piece = slice(int(first[longest]), int(last[longest]) + 1)
-    cut = {f.name: getattr(read, f.name)[piece] for f in fields(read)
-           if f.name in {"stamp_ns", "received_ns", "t", *recording.CHANNELS}}
-    pause = float(read.t[pauses[0] + 1] - read.t[pauses[0]])
-    note = (f"the recording pauses {'once' if len(pauses) == 1 else f'{len(pauses)} times'}, first for {pause:.0f} s: "
-            f"only its longest piece is used, {cut['t'][-1] - cut['t'][0]:.1f} s from {cut['t'][0]:.1f} s on")
-    inside = (read.gaps[:, 0] >= piece.start) & (read.gaps[:, 0] < piece.stop - 1)
-    gaps = read.gaps[inside] - np.array([piece.start, 0])
-    return replace(read, **{**cut, "t": cut["t"] - cut["t"][0]}, gaps=gaps, truth=None, notes=(*read.notes, note))
+def from_recording(read: Recording, sensing: Mapping[str, float], held_out: float = 0.3) -> Signals:
+    """Signals of a calibrated rig.
+
+    Args:
+        read: the recording.
+        sensing: parameters of the model's measurement chain.
+        held_out: share of the recording at its end that models are not fitted to.
+
+    Raises:
+        RecordingError: no verdict is possible; one line that says why.
+    """
+    index, period = regular_grid(read)
+    return from_arrays(_columns(read, index), period, sensing, held_out, read.path, read.notes)
+
+
+def from_uncalibrated(read: Recording, sensing: Mapping[str, float], held_out: float = 0.3) -> Signals:
+    """Signals of an uncalibrated rig.
+
+    Args:
+        read: the recording.
+        sensing: parameters of the model's measurement chain; only the pulses of the speed are used, if the speed
+            read behaves like them.
+        held_out: share of the recording at its end that models are not fitted to.
+
+    Raises:
+        RecordingError: no verdict is possible; one line that says why.
+    """
+    if not np.isfinite(read.theta).any():
+        raise RecordingError(f"{read.path}: no arm angle was measured (joint_states, position of 'arm'); nothing "
+                             "to compare")
+    driven = np.isfinite(read.duty).any() and float(np.nanmax(read.duty)) >= STILL
+    alone = not any(np.isfinite(getattr(read, c)).any() for c in ("omega", "i_a", "v_a"))
+    index, period = irregular_grid(read.stamp_ns, LONGEST_PERIOD if driven and alone else math.inf)
+    columns = _columns(read, index)
+    t = (read.stamp_ns - read.stamp_ns[0]) * 1e-9
+    sigma = {"theta": reading_noise_at(t, read.theta)}
+    for name in ("i_a", "v_a", "omega"):
+        x = getattr(read, name)
+        if np.isfinite(x).sum() > 10:
+            sigma[name] = reading_noise_at(t, x)
+    own = _own_sensing(read, sensing)
+    duty = columns["duty"]
+    idle = not np.isfinite(duty).any() or bool(np.nanmax(np.abs(duty)) < STILL)
+    if idle and not any(np.isfinite(columns[c]).any() and np.nanstd(columns[c]) > MOVES * sigma.get(c, 0.0)
+                        for c in ("omega", "i_a", "v_a")):
+        return free_decay(read, columns["theta"], period, sigma["theta"], held_out,
+                          commanded=bool(np.isfinite(duty).any()))
+    signals = from_arrays(columns, period, own, held_out, read.path, read.notes)
+    if signals.pulses is not None:  # the accuracy of the speed is that of its pulses
+        sigma.pop("omega", None)
+    said = (f"angle: a reading has a standard deviation of {degrees(sigma['theta'])}, from noise and resolution, "
+            "estimated from the recording")
+    return replace(signals, sigma={**signals.sigma, **sigma}).noted(said)
+
+
+def _columns(read: Recording, index: np.ndarray) -> dict[str, np.ndarray]:
+    """The channels and the duty on the grid, by name; NaN where nothing was measured."""
+    columns = {}
+    for name in (*CHANNELS, "duty"):
+        columns[name] = np.full(int(index[-1]) + 1, np.nan)
+        columns[name][index] = getattr(read, name)
+    return columns
+
+
+def _own_sensing(read: Recording, sensing: Mapping[str, float]) -> dict[str, float]:
+    """The measurement chain as the recording shows it; pulses only if the speed is held as pulses would hold it."""
+    own = {**sensing, **{f"{c}_{what}": 0.0 for c in ("angle", "current", "voltage") for what in ("lsb", "noise")}}
+    pulses = sensing["speed_pulses_per_rev"]
+    speed = read.omega[np.isfinite(read.omega)]
+    if pulses > 0.0 and len(speed) > 10:
+        changes = np.flatnonzero(np.diff(speed)) + 1
+        held = np.diff(changes) * read.period
+        turn = 2.0 * math.pi / pulses / np.maximum(np.abs(speed[changes[1:]]), 1e-3)
+        fits = np.abs(held - turn) <= 1.5 * read.period
+        if len(held) < 5 or np.mean(fits) < 0.7 or np.median(held) < 2.5 * read.period:
+            own["speed_pulses_per_rev"] = 0.0
+    return own

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readings that say less than they seem to: at the end of a sensor's range, or single ones that jump out."""
+"""Readings to leave out: at the end of a sensor's range, or single ones far from their neighbours."""
 
 from __future__ import annotations
 
@@ -12,34 +12,39 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 CHANCE = 1e-6
-"""Probability of a false alarm by chance, a channel."""
+"""Probability of a false alarm in a channel without saturation (choice)."""
 
 QUIET = 0.9
-"""Share of equal neighbours from which on a channel shows no noise that could tell a limit from a rest."""
+"""Share of equal neighbours above which a channel shows no noise that could tell a limit from a rest (choice)."""
 
 SHORTEST = 4
-"""Equal readings in a row that are no limit, whatever the noise."""
+"""Equal readings in a row that never count as a limit, whatever the noise (choice)."""
 
 APPROACH = 15
-"""Samples over which a smooth signal must not slow down before it stands still: what stops at once hits a limit."""
+"""Samples over which the signal must keep its speed before it stops at a limit: 30 ms at 490 Hz (choice)."""
 
 NEIGHBOURS = 3
-"""Readings on either side that a single one is compared with."""
+"""Readings on either side with which a single one is compared (choice)."""
 
 FAR = 8.0
-"""Standard deviations of the noise by which a reading that jumps out leaves its neighbours."""
+"""Standard deviations of the noise beyond which a single reading is an outlier.
+
+Choice: normal noise exceeds it in one of 10^15 readings, which leaves room for heavier tails."""
 
 
 def saturated(x: Array, *, smooth: bool = False) -> Mask:
-    """Samples (N,) of a channel that sit at the end of its range, where the true value may be anything beyond.
+    """Find the samples of a channel that sit at the end of its range, where the true value may lie beyond.
 
-    Above a limit every reading is the same, to the last bit and the noise included; at a plateau that is only a
-    plateau, the noise goes on. So the largest and the smallest reading are limits if they are repeated in a row more
-    often than the noise of the channel lets them be. Speed held between pulses is no case for this.
+    At a limit all readings are equal to the last bit; at a true plateau the noise goes on. The largest and the
+    smallest reading are limits if they repeat in a row more often than the noise of the channel allows. A speed that is
+    held between pulses must not be tested.
 
     Args:
         x: (N,) readings, NaN where missing.
-        smooth: the signal has no jumps (an angle): then a limit is found without noise too, by a stop that is sudden.
+        smooth: whether the signal has no jumps (an angle). A limit is then found without noise too, by a sudden stop.
+
+    Returns:
+        (N,) mask.
     """
     out = np.zeros(len(x), dtype=bool)
     known = np.flatnonzero(np.isfinite(x))
@@ -52,7 +57,7 @@ def saturated(x: Array, *, smooth: bool = False) -> Mask:
         if not inside.any():
             continue
         equal = float(np.mean(y[1:][inside] == y[:-1][inside]))
-        starts, lengths = _runs(at)
+        starts, lengths = runs(at)
         if equal < QUIET:
             enough = 1.0 + math.log(CHANCE / len(y)) / math.log(max(equal, 1e-3))
             hit = bool((lengths >= max(enough, SHORTEST)).any())
@@ -63,14 +68,14 @@ def saturated(x: Array, *, smooth: bool = False) -> Mask:
     return out
 
 
-def _runs(at: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First index and length of each run of true values."""
+def runs(at: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First index and length of each run of true values in a mask (N,)."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], at, [False])).astype(np.int8)))
     return edges[::2], edges[1::2] - edges[::2]
 
 
 def _sudden(y: Array, starts: NDArray[np.int64], end: float) -> bool:
-    """Whether a smooth signal comes to `end` at full speed: over the last samples as far as over those before."""
+    """Whether a smooth signal reaches `end` without slowing down."""
     starts = starts[starts >= 2 * APPROACH]
     if not len(starts):
         return False
@@ -82,11 +87,14 @@ def _sudden(y: Array, starts: NDArray[np.int64], end: float) -> bool:
 
 
 def jumps_out(x: Array, sigma: float) -> Mask:
-    """Samples (N,) that stand alone: far from all of their neighbours, which agree with each other.
+    """Find single samples far from all of their neighbours, which agree with each other.
 
     Args:
         x: (N,) readings, NaN where missing.
-        sigma: standard deviation of a reading, noise and quantisation.
+        sigma: standard deviation of a reading, with noise and quantisation.
+
+    Returns:
+        (N,) mask.
     """
     out = np.zeros(len(x), dtype=bool)
     known = np.flatnonzero(np.isfinite(x))
@@ -98,9 +106,31 @@ def jumps_out(x: Array, sigma: float) -> Mask:
     others = np.delete(window, k, axis=1)
     middle = np.median(others, axis=1)
     spread = np.median(np.abs(others - middle[:, None]), axis=1)
-    # a step has half of the neighbours on either level; a reading that jumps out leaves both; one more may do so too
+    # at a step half of the neighbours are on either level; an outlier leaves both; one neighbour may be an outlier too
     others.sort(axis=1)
     low, high = others[:, 1], others[:, -2]
     outside = np.maximum(y - high, low - y)
     out[known] = (np.abs(y - middle) > FAR * (sigma + spread)) & (outside > 0.5 * np.abs(y - middle))
     return out
+
+
+def far_from_median(x: Array, sigma: float) -> Mask:
+    """Find samples far from the median of seven, where the spread of the seven is small.
+
+    As `jumps_out`, for a speed whose noise grows with it.
+
+    Args:
+        x: (N,) readings, NaN where missing.
+        sigma: standard deviation of a reading.
+
+    Returns:
+        (N,) mask.
+    """
+    if len(x) < 2 * NEIGHBOURS + 1:
+        return np.zeros(len(x), dtype=bool)
+    window = np.lib.stride_tricks.sliding_window_view(np.pad(x, NEIGHBOURS, mode="edge"), 2 * NEIGHBOURS + 1)
+    known = np.isfinite(window).sum(axis=1) >= NEIGHBOURS + 1
+    median, spread = np.zeros(len(x)), np.zeros(len(x))
+    median[known] = np.nanmedian(window[known], axis=1)
+    spread[known] = np.nanmedian(np.abs(window[known] - median[known, None]), axis=1)
+    return known & (np.abs(x - median) > FAR * (sigma + spread) + 0.1 * np.abs(median))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cut chains of a rig with angle and command alone, which count their runs and do not repeat a motor's.
+"""Cut chains of an uncalibrated rig: they count their simulations, and do not repeat a motor's.
 
-Most unknowns of such a rig (the arm's numbers, where it begins, its effects) leave the speed as it is.
+Most parameters of such a rig (of the arm, its initial state, its effects) leave the speed as it is.
 """
 
 from __future__ import annotations
@@ -12,7 +12,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis.chain.chain import Chain, Chains, Values
+from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
+from aeropend_ident.diagnosis.chain.values import Values
+from aeropend_ident.diagnosis.policy import UNCALIBRATED, Policy
+from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import dynamics
 from aeropend_sim.model.effects import CATALOGUE
@@ -20,53 +23,62 @@ from aeropend_sim.model.parameters import Model
 
 Array = NDArray[np.float64]
 
-BEHIND = ("mgd_over_J", "c_over_J", "L_over_J", "initial.theta", "initial.theta_dot")
+BEHIND_MOTOR = ("mgd_over_J", "c_over_J", "L_over_J", "initial.theta", "initial.theta_dot")
 """Values that act behind the motor."""
 
-RUNS = 2
-"""Runs of the motor that are kept: where a search stands, and the last one that it tried."""
+KEPT = 2
+"""Runs of the motor that are kept: at the point of a search, and at its last trial."""
 
 
-class ThriftyChain(Chain):
+class CachedChain(CutChain):
     """A chain that keeps its last runs of the motor, each thread its own."""
 
     def motor(self, values: Values, stop: int | None = None) -> tuple[Array, Array, Array]:
-        """As `Chain.motor`."""
+        """As `CutChain.motor`."""
         s = self.signals
-        if s.has("v_a") or s.has("i_a") or s.has("omega"):  # what feeds the motor changes while the search goes on
+        if s.has("v_a") or s.has("i_a") or s.has("omega"):  # the motor's input changes while the search goes on
             return super().motor(values, stop)
         if not hasattr(self, "kept"):
             self.kept = threading.local()
         runs: list[tuple[object, tuple[Array, Array, Array]]] = self.kept.__dict__.setdefault("runs", [])
         steps = dynamics.steps_in(self.valued(values), s.period)
-        key = (stop, steps, tuple(sorted((n, v) for n, v in values.items() if _at_motor(n))))
-        k = next((k for k, (other, _) in enumerate(runs) if other == key), -1)
-        run = runs.pop(k) if k >= 0 else (key, super().motor(values, stop))
+        wanted = (stop, steps, tuple(sorted((n, v) for n, v in values.items() if _acts_on_motor(n))))
+        k = next((k for k, (other, _) in enumerate(runs) if other == wanted), -1)
+        run = runs.pop(k) if k >= 0 else (wanted, super().motor(values, stop))
         runs.append(run)
-        del runs[:-RUNS]
+        del runs[:-KEPT]
         return run[1]
 
 
-def _at_motor(name: str) -> bool:
-    owner, _, parameter = name.partition(".")
-    return name not in BEHIND and owner != "sensing" and not (parameter and owner in CATALOGUE
-                                                              and CATALOGUE[owner].place == "arm")
+def _acts_on_motor(name: str) -> bool:
+    owner = key(name).owner
+    return name not in BEHIND_MOTOR and owner != "sensing" and not (
+        owner in CATALOGUE and CATALOGUE[owner].place == "arm")
 
 
-class ThriftyChains(Chains):
-    """Chains of an unknown rig; `runs` counts how often their residuals were taken."""
+class CachedChains(CutChains):
+    """Cut chains of an uncalibrated rig, which count how often residuals are computed; see `CutChains`."""
 
-    def __init__(self, model: Model, recordings: Sequence[Signals]) -> None:
-        super().__init__(model, recordings, fit_nominal=True)
-        self.each = [ThriftyChain.cut(model, signals) for signals in recordings]
-        self.runs = 0
+    def __init__(self, model: Model, recordings: Sequence[Signals], policy: Policy = UNCALIBRATED) -> None:
+        super().__init__(model, recordings, policy)
+        self._counted = 0
+        self._lock = threading.Lock()  # fits run in threads
 
-    def residuals(self, block: str) -> Callable[[Values], dict[str, Array]]:
-        """As `Chains.residuals`, counted."""
-        function = super().residuals(block)
+    def _cut(self, signals: Signals) -> CutChain:
+        return CachedChain.cut(self.model, signals)
+
+    @property
+    def runs(self) -> int:
+        """Number of times that residuals were computed."""
+        return self._counted
+
+    def residuals(self, stage: str) -> Callable[[Values], dict[str, Array]]:
+        """As `CutChains.residuals`, counted."""
+        function = super().residuals(stage)
 
         def counted(values: Values) -> dict[str, Array]:
-            self.runs += 1
+            with self._lock:
+                self._counted += 1
             return function(values)
 
         return counted

@@ -1,10 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nominal model of a rig whose numbers nobody knows, identified from its recordings.
+"""The nominal model of an uncalibrated rig, identified from its recordings.
 
-Which numbers can be free depends on what was measured. A search needs to begin near enough: an arm that swings freely
-tells its numbers by its turning points; one that is driven, by linear regression of its weak form (the equation of
-motion times a bump, integrated by parts, so that no reading is differentiated) for each of a few curves and lags from
-the duty to the lift. Then the readings are fitted, first over the beginning, then over more and more.
+The channels decide which parameters are free:
+
+- Angle alone, of an arm that swings freely: gravity, viscous damping and the zero of the angle. The search starts from
+  the turning points.
+- Angle and command: a static curve from duty to lift, with a dead zone and a curvature, behind one lag. It is
+  expressed by the model file's own map and motor, of which as many parameters are free as the angle can determine. The
+  search starts from a linear regression of the weak form: the equation of motion times a test function, integrated by
+  parts, so that no reading is differentiated. One regression is made for each of some curves and lags.
+- Speed, current or voltage too: every parameter of the model file, stage by stage.
+
+Then the readings are fitted, first over the beginning of the recordings, then over growing horizons.
 """
 
 from __future__ import annotations
@@ -17,112 +24,127 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis.chain.cached_chain import ThriftyChains
-from aeropend_ident.diagnosis.chain.chain import BLOCKS, Chain, Chains, of_recording, with_values
-from aeropend_ident.diagnosis.chain.priors import angle_only, free_swinging, nominal_unknowns
-from aeropend_ident.estimation.map_fit import Fit, Unknown, fit
+from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
+from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
+from aeropend_ident.diagnosis.chain.priors import nominal_parameters
+from aeropend_ident.diagnosis.chain.values import STAGES, of_rig, with_values
+from aeropend_ident.diagnosis.policy import Policy, angle_only, policy_of
+from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess
+from aeropend_ident.estimation.parameter import Parameter, key
+from aeropend_ident.signals.free_decay import turning_points
+from aeropend_ident.signals.noise import resolution
 from aeropend_ident.signals.signals import Signals
-from aeropend_ident.signals.uncalibrated import resolution, turning_points
+from aeropend_ident.signals.smoothing import block_mean
 from aeropend_sim.model import actuator, dynamics
 from aeropend_sim.model.parameters import Model
 
 Array = NDArray[np.float64]
 
-SHARES = (0.15, 0.35, 1.0)
-"""Parts of the fitted data over which a fit is drawn out."""
+HORIZONS = (0.15, 0.35, 1.0)
+"""Parts of the training data over which a fit is made one after the other (choice)."""
+
+SHORTEST_HORIZON = 3.0
+"""[s] Shortest horizon: some swings of the arm (choice)."""
 
 ROUNDS = 4
-"""Rounds of a fit on the way."""
+"""Rounds of the fits over each horizon; the last fit of a search has more (choice)."""
 
 COARSE = 0.01
-"""s between samples that a search begins with."""
+"""[s] Sample period of the data that a search starts with: far below the arm's time constants."""
 
-BUMPS = (0.25, 0.5)
-"""Half-widths of the test functions of the weak form, s."""
+TEST_FUNCTIONS = (0.25, 0.5)
+"""[s] Half-widths of the test functions of the weak form: a quarter and a half of a usual period of the arm."""
 
 LAGS = (0.04, 0.12, 0.4, 1.0)
-"""Lags, s, of which each is followed up with the static curve that goes best with it."""
+"""[s] Lags of the rotor that searches start from; each starts with the static curve that fits best with it (choice)."""
 
-WIDE = 2.0
-"""Factor on the priors of numbers while a nominal model is looked for."""
+DEAD_ZONES, BENDS, LOADS = (0.0, 0.04, 0.12), (0.003, 0.08, 0.6), (0.02, 1.0, 4.0)
+"""Static curves that searches start from: dead zone of the duty, k3/k2, and voltage of load over back-EMF (choice)."""
 
-SETTLES = 0.1
-"""s over which voltage, current and speed are averaged to begin with."""
+WIDER = 2.0
+"""Factor on the standard deviations of the priors while a nominal model is searched (choice)."""
+
+WINDING_SETTLES = 0.1
+"""[s] Blocks over which voltage, current and speed are averaged for a start: longer than any winding's L_a/R_a."""
 
 SCATTER, MINIMUM_FREEDOM = 1.3, 30
-"""Factor by which a local scatter must exceed the noise of a reading to replace it, and degrees of freedom to tell."""
+"""Ratio of the scatter around a smooth swing to a reading's noise above which it counts as the noise, and the degrees
+of freedom needed (choice)."""
 
 SIZES = {"command_delay.delay": (0.01, 0.03, 0.09), "thrust_lag.tau": (0.03, 0.1, 0.3),
          "thrust_exponent.n": (1.3, 1.65, 2.35, 2.7)}
-"""Sizes that the search begins with for effects which a curve and a lag from duty to lift take for other ones."""
+"""Sizes that searches start from, for effects that a curve and a lag absorb in part."""
 
 FOLLOWED = 2
-"""Of these sizes, how many are followed up."""
+"""Number of these sizes from which a search is made (choice)."""
 
 HANGS = 0.1
-"""rad: an arm that begins no farther from hanging than this is taken to begin with a rotor that stands."""
+"""[rad] An arm that starts nearer to hanging than this is taken to start with a rotor that stands (choice)."""
 
 CURVE = 11
-"""Points of the static curve from duty to lift."""
+"""Points of the static curve from duty to lift that is reported."""
 
 FULL = 2.3
-"""V at full duty that the map of a rig without voltage is given: only its product with other numbers shows."""
+"""[V] Voltage at full duty of a rig without a measured voltage: only its product with other parameters acts."""
 
 
-def identify(model: Model, recordings: Sequence[Signals]) -> tuple[Model, list[Signals]]:
-    """The nominal model that fits the recordings best, as rich as their channels allow.
+def fit_nominal_model(model: Model, recordings: Sequence[Signals]) -> tuple[Model, list[Signals]]:
+    """Identify the nominal model, with as many free parameters as the channels allow.
 
     Args:
-        model: gives what the recordings cannot fix. recordings: of one rig.
+        model: gives what the recordings cannot determine.
+        recordings: of one rig.
 
     Returns:
-        The model, and the recordings, with the noise that they turned out to have.
+        The model, and the recordings with their noise as estimated from the fit.
     """
     name = f"{model.name}, identified"
-    if free_swinging(recordings):
-        found, f = _drawn_out(_swinging(model, recordings), recordings)
-        chains = Chains(found, recordings, fit_nominal=True)
-        noisier = [_with_local_noise(chain, chains.own(f.values, k)) for k, chain in enumerate(chains.each)]
+    policy = policy_of(recordings, fit_nominal=True)
+    if not policy.driven:
+        found, f = _over_growing_horizons(_start_of_decay(model, recordings), recordings)
+        chains = CutChains(found, recordings, policy)
+        noisier = [_with_local_noise(chain, chains.values_of(f.values, k)) for k, chain in enumerate(chains.each)]
         return replace(found, name=name), noisier
     if angle_only(recordings):
         coarse = [_coarser(s) for s in recordings]
-        begun = [_drawn_out(m, coarse) for m in _driven(model, coarse)]
-        counts = {k: max(f.independent[k] for _, f in begun) for k in begun[0][1].independent}
-        best = max(begun, key=lambda b: b[1].evidence(counts))[0]
+        begun = [_over_growing_horizons(m, coarse) for m in _starts_of_driven(model, coarse)]
+        ess = largest_ess(f for _, f in begun)
+        best = max(begun, key=lambda b: b[1].log_evidence(ess))[0]
         return replace(_fitted(best, recordings)[0], name=name), list(recordings)
-    return replace(_measured(model, recordings), name=name), list(recordings)
+    return replace(_stage_by_stage(model, recordings, policy), name=name), list(recordings)
 
 
-def _measured(model: Model, recordings: Sequence[Signals]) -> Model:
-    """The nominal model of a rig with more than angle and command: part by part, each from what feeds it."""
-    chains = Chains(model, recordings, fit_nominal=True)
-    for block in BLOCKS:
-        if block == "motor":
-            chains = _again(chains, _motor_begun(chains))
-        elif block == "arm":
-            chains = _again(chains, _arm_begun(chains))
-        unknowns = nominal_unknowns(chains, block)
-        f = fit(chains.residuals(block), [replace(u, sd=WIDE * u.sd) for u in unknowns])
+def _stage_by_stage(model: Model, recordings: Sequence[Signals], policy: Policy) -> Model:
+    """The nominal model of a rig with more channels than the angle: each stage from its measured input."""
+    chains = CutChains(model, recordings, policy)
+    for stage in STAGES:
+        if stage == "motor":
+            chains = _cut_again(chains, _start_of_motor(chains))
+        elif stage == "arm":
+            chains = _cut_again(chains, _start_of_arm(chains))
+        parameters = nominal_parameters(chains, stage)
+        f = fit(chains.residuals(stage), [replace(p, sd=WIDER * p.sd) for p in parameters])
         if f.residuals:
-            chains = _again(chains, chains.each[0].valued(shared(f.values)))
+            chains = _cut_again(chains, chains.each[0].valued(of_rig(f.values)))
     return chains.model
 
 
-def _again(chains: Chains, model: Model) -> Chains:
-    """The chains cut anew under another model, each part fed as the one before explains it."""
-    again = Chains(model, chains.recordings, fit_nominal=True)
-    again.feed_next("actuator", {})
-    again.feed_next("motor", {})
+def _cut_again(chains: CutChains, model: Model) -> CutChains:
+    """The chains cut again under another model."""
+    again = CutChains(model, chains.recordings, chains.policy)
+    again.set_next_input("actuator", {})
+    again.set_next_input("motor", {})
     return again
 
 
-def _motor_begun(chains: Chains) -> Model:
-    """Where the search for the motor's numbers begins."""
+def _start_of_motor(chains: CutChains) -> Model:
+    """Start values of the motor's parameters."""
     model, recordings = chains.model, chains.recordings
     n = dict(model.model)
     if all(s.has("v_a") and s.has("i_a") and s.has("omega") for s in recordings):
-        # v = R i + K_e ω, but for what the winding stores, which averages out
-        rows = [np.column_stack([_calm(x, s.period) for x in (s.v_a, s.i_a, s.true_speed)]) for s in recordings]
+        # v = R i + K_e ω; the voltage of the inductance averages out
+        rows = [np.column_stack([block_mean(x, max(1, round(WINDING_SETTLES / s.period)))
+                                 for x in (s.v_a, s.i_a, s.true_speed)]) for s in recordings]
         v, i, w = np.concatenate(rows).T
         known = np.isfinite(v) & np.isfinite(i) & np.isfinite(w) & (w > 0.0)
         if known.sum() > 20:
@@ -136,7 +158,7 @@ def _motor_begun(chains: Chains) -> Model:
     if any(s.has("v_a") for s in recordings) or not all(s.has("omega") for s in recordings):
         return model
     found = []
-    for dead, bend, load, lag in product((0.0, 0.04, 0.12), (0.003, 0.08, 0.6), (0.02, 1.0, 4.0), (0.04, 0.12, 0.4)):
+    for dead, bend, load, lag in product(DEAD_ZONES, BENDS, LOADS, LAGS[:3]):
         numbers = _curve(n, dead, bend, load, lag)
         squares, scale = 0.0, []
         for s in recordings:
@@ -145,14 +167,14 @@ def _motor_begun(chains: Chains) -> Model:
             scale.append(float(w[known] @ seen[known]) / max(float(w[known] @ w[known]), 1e-12))
             squares += float(np.sum((seen[known] - scale[-1] * w[known]) ** 2))
         size = float(np.mean(scale))
-        if size > 0.0:  # a speed in other units is a motor of another constant
+        if size > 0.0:  # another speed at the same voltage is a motor of another constant
             found.append((squares, {**numbers, "K_e": numbers["K_e"] / size, "K_t": numbers["K_t"] / size,
                                     "k_load": numbers["k_load"] / size**3, "J_m": numbers["J_m"] / size**2}))
     return replace(model, model=min(found, key=lambda item: item[0])[1]) if found else model
 
 
 def _best_inertia(model: Model, recordings: Sequence[Signals]) -> float:
-    """The rotor's inertia, of a few, with which the speed follows the measured voltage best."""
+    """[kg·m²] The rotor inertia, of some, with which the speed follows the measured voltage best."""
     tried = []
     for lag in (0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28):
         n = {**model.model, "J_m": lag * model.model["K_t"] * model.model["K_e"] / model.model["R_a"]}
@@ -167,8 +189,8 @@ def _best_inertia(model: Model, recordings: Sequence[Signals]) -> float:
     return min(tried)[1]
 
 
-def _arm_begun(chains: Chains) -> Model:
-    """Where the search for the arm's numbers begins, with the speed as measured."""
+def _start_of_arm(chains: CutChains) -> Model:
+    """Start values of the arm's parameters, from a regression on the measured speed."""
     model = chains.model
     coarse = [replace(_coarser(chain.signals), duty=chain.signals.duty[:0]) for chain in chains.each]
     lifts = []
@@ -184,19 +206,11 @@ def _arm_begun(chains: Chains) -> Model:
                                  "L_over_J": float(gain) / model.model["k_thrust"]})
 
 
-def _calm(x: Array, period: float) -> Array:
-    """Means (M,) of x (N,) over pieces in which a winding settles."""
-    width = max(1, round(SETTLES / period))
-    n = len(x) // width
-    rows = x[:n * width].reshape(n, width)
-    count = np.isfinite(rows).sum(axis=1)
-    return np.where(count > 0, np.nansum(rows, axis=1) / np.maximum(count, 1), np.nan)
+def _with_local_noise(chain: CutChain, values: Mapping[str, float]) -> Signals:
+    """The recording with the scatter around any smooth swing as the noise of its angle.
 
-
-def _with_local_noise(chain: Chain, values: Mapping[str, float]) -> Signals:
-    """The recording with the scatter that even a swing of free amplitude, phase and shape leaves as its noise.
-
-    Unsteady stamps make an angle scatter more than its sensor does, and no model of the arm can explain that.
+    Irregular stamps make the angle scatter more than its sensor does; no model of the arm explains that. In each
+    window of two periods the residual is regressed on the angle, its rate, and low powers of both.
     """
     s = chain.signals
     theta, rate = chain.arm_motion(values, s.train)
@@ -214,46 +228,35 @@ def _with_local_noise(chain: Chain, values: Mapping[str, float]) -> Signals:
         squares += float(np.sum((r[at] - columns @ x) ** 2))
         freedom += len(at) - int(rank)
     seen = math.sqrt(squares / freedom) if freedom > MINIMUM_FREEDOM else 0.0
-    if seen < SCATTER * s.sigma["theta"]:  # differences take some motion for noise, where samples are far apart
+    if seen < SCATTER * s.sigma["theta"]:  # where samples are far apart, differences take some motion for noise
         least = min(max(seen, resolution(s.theta) / math.sqrt(12.0)), s.sigma["theta"])
         return replace(s, sigma={**s.sigma, "theta": least}) if freedom > MINIMUM_FREEDOM else s
     said = (f"the angle scatters by {math.degrees(seen):.2g} degrees around any smooth swing, more than its sensor "
-            "does: unsteady stamps would do that; it counts as noise")
-    return replace(s, sigma={**s.sigma, "theta": seen}, notes=(*s.notes, said))
+            "does; irregular stamps have this effect; the scatter counts as noise")
+    return replace(s, sigma={**s.sigma, "theta": seen}).noted(said)
 
 
-def _drawn_out(model: Model, recordings: Sequence[Signals], *effect: Unknown) -> tuple[Model, Fit]:
-    """Fit over the beginning, then over more and more of the recordings; an effect's unknown along."""
-    for share in SHARES:
-        least = round(3.0 / recordings[0].period)
+def _over_growing_horizons(model: Model, recordings: Sequence[Signals], *effect: Parameter) -> tuple[Model, Fit]:
+    """Fit over the beginning, then over more and more of the recordings, with the parameters of an effect if given."""
+    for share in HORIZONS:
+        least = round(SHORTEST_HORIZON / recordings[0].period)
         part = [replace(s, train=min(max(round(share * s.train), least), s.train)) for s in recordings]
         model, f = _fitted(model, part, ROUNDS, *effect)
     return model, f
 
 
-def _fitted(model: Model, recordings: Sequence[Signals], rounds: int = 10, *effect: Unknown) -> tuple[Model, Fit]:
-    chains = ThriftyChains(model, recordings)
-    along = [replace(u, start=_value(model, u.name)) for u in effect]
-    f = fit(chains.residuals("arm"), [*nominal_unknowns(chains, "arm"), *along], rounds)
-    return chains.each[0].valued(shared(f.values)), f
+def _fitted(model: Model, recordings: Sequence[Signals], rounds: int = 10, *effect: Parameter) -> tuple[Model, Fit]:
+    chains = CachedChains(model, recordings, policy_of(recordings, fit_nominal=True))
+    along = [replace(p, start=model.effects[key(p.name).owner][key(p.name).name]) for p in effect]
+    f = fit(chains.residuals("arm"), [*nominal_parameters(chains, "arm"), *along], rounds)
+    return chains.each[0].valued(of_rig(f.values)), f
 
 
-def _value(model: Model, name: str) -> float:
-    effect, _, parameter = name.partition(".")
-    return model.effects[effect][parameter]
+def _start_of_decay(model: Model, recordings: Sequence[Signals]) -> Model:
+    """Gravity, damping and zero from the turning points of the longest decay.
 
-
-def shared(values: Mapping[str, float]) -> dict[str, float]:
-    """The values that hold for the rig: without initial states, and with what differs from run to run averaged."""
-    out: dict[str, list[float]] = {}
-    for name, value in values.items():
-        if not name.startswith("initial."):
-            out.setdefault(of_recording(name)[0], []).append(value)
-    return {name: float(np.mean(all_)) for name, all_ in out.items()}
-
-
-def _swinging(model: Model, recordings: Sequence[Signals]) -> Model:
-    """Gravity, damping and zero from the turning points of the longest free swinging."""
+    The period of a pendulum of amplitude a is T0 (1 + a²/16 + 11 a⁴/3072).
+    """
     s = max(recordings, key=len)
     known = np.flatnonzero(np.isfinite(s.theta))
     x, t = s.theta[known], known * s.period
@@ -262,7 +265,6 @@ def _swinging(model: Model, recordings: Sequence[Signals]) -> Model:
     middle = float(np.mean(0.5 * (x[points][-3:-1] + x[points][-2:]))) if len(points) > 3 else float(np.median(x))
     half = np.diff(at)
     a = 0.5 * size
-    # period of a pendulum that swings by a: T = T0 (1 + a²/16 + 11 a⁴/3072)
     half = half / (1.0 + a**2 / 16.0 + 11.0 * a**4 / 3072.0)
     gravity = (math.pi / float(np.median(half))) ** 2
     slope = float(np.polyfit(0.5 * (at[1:] + at[:-1]), np.log(np.maximum(size, 1e-9)), 1)[0]) if len(size) > 1 else -0.5
@@ -272,54 +274,55 @@ def _swinging(model: Model, recordings: Sequence[Signals]) -> Model:
 
 
 def _coarser(s: Signals) -> Signals:
-    """The recording with means over some samples in place of each."""
+    """The recording with block means in place of samples; angle and duty only."""
     every = max(1, math.floor(COARSE / s.period))
     if every == 1:
         return s
     n = len(s) // every
-
-    def mean(x: Array) -> Array:
-        rows = x[:n * every].reshape(n, every)
-        count = np.isfinite(rows).sum(axis=1)
-        return np.where(count > 0, np.nansum(rows, axis=1) / np.maximum(count, 1), np.nan)
-
-    theta = mean(s.theta)
     empty = np.full(n, np.nan)
-    return replace(s, period=every * s.period, duty=mean(s.duty), theta=theta, omega=empty, i_a=empty, v_a=empty,
-                   pulses=None, false_speed=np.zeros(n, dtype=bool), train=max(1, s.train // every))
+    return replace(s, period=every * s.period, duty=block_mean(s.duty, every), theta=block_mean(s.theta, every),
+                   omega=empty, i_a=empty, v_a=empty, pulses=None, false_speed=np.zeros(n, dtype=bool),
+                   train=max(1, s.train // every))
 
 
-def _driven(model: Model, recordings: Sequence[Signals]) -> list[Model]:
-    """The likeliest beginnings for a rig with command and angle alone."""
-    found = _likely(model, recordings, [_WeakForm(s) for s in recordings])
-    # a quick rotor with a sluggish arm looks much like a sluggish rotor with a quick arm: each lag has its say
+def _starts_of_driven(model: Model, recordings: Sequence[Signals]) -> list[Model]:
+    """The likeliest start of each lag, for a rig with command and angle alone.
+
+    A fast rotor with a slow arm resembles a slow rotor with a fast arm; so a search starts from each lag.
+    """
+    found = _likeliest(model, recordings, [_WeakForm(s) for s in recordings])
     first = {lag: next((m for _, own, m in found if own == lag), None) for lag in LAGS}
     return [m for m in first.values() if m is not None] or [model]
 
 
-def with_effect(model: Model, recordings: Sequence[Signals], effect: Unknown) -> dict[str, float]:
-    """Numbers, states and the size of an effect of `SIZES`, identified together: numbers found without it mislead.
+def fit_with_effect(model: Model, recordings: Sequence[Signals], effect: Parameter) -> dict[str, float]:
+    """Identify the nominal model together with the size of an effect: parameters found without it are biased.
 
     Args:
-        model: as identified without the effect. recordings: with command and angle alone. effect: its unknown.
+        model: as identified without the effect.
+        recordings: with command and angle alone.
+        effect: size of an effect of `SIZES`.
+
+    Returns:
+        Parameters, initial states and the size, by name; empty if no start is possible.
     """
     coarse = [_coarser(s) for s in recordings]
     tests = [_WeakForm(s) for s in coarse]
     likely = [found[0] for size in SIZES[effect.name]
-              if (found := _likely(with_values(model, {effect.name: size}), coarse, tests))]
+              if (found := _likeliest(with_values(model, {effect.name: size}), coarse, tests))]
     likely.sort(key=lambda item: item[0])
-    fits = [_drawn_out(m, coarse, effect)[1] for *_, m in likely[:FOLLOWED]]
+    fits = [_over_growing_horizons(m, coarse, effect)[1] for *_, m in likely[:FOLLOWED]]
     if not fits:
         return {}
-    counts = {k: max(f.independent[k] for f in fits) for k in fits[0].independent}
-    return max(fits, key=lambda f: f.evidence(counts)).values
+    ess = largest_ess(fits)
+    return max(fits, key=lambda f: f.log_evidence(ess)).values
 
 
-def _likely(model: Model, recordings: Sequence[Signals], tests: Sequence[_WeakForm]
-            ) -> list[tuple[float, float, Model]]:
-    """Curves and lags, the likeliest first: sum of squares left, lag, model."""
+def _likeliest(model: Model, recordings: Sequence[Signals], tests: Sequence[_WeakForm]
+               ) -> list[tuple[float, float, Model]]:
+    """Static curves and lags, the likeliest first: sum of squares left, lag, model."""
     found = []
-    for dead, bend, load, lag in product((0.0, 0.04, 0.12), (0.003, 0.08, 0.6), (0.02, 1.0, 4.0), LAGS):
+    for dead, bend, load, lag in product(DEAD_ZONES, BENDS, LOADS, LAGS):
         numbers = _curve(model.model, dead, bend, load, lag)
         m = replace(model, model=numbers)
         left, solution = _regress(tests, [_lift(m, s) for s in recordings])
@@ -333,11 +336,15 @@ def _likely(model: Model, recordings: Sequence[Signals], tests: Sequence[_WeakFo
 
 
 def lift(model: Model, recordings: Sequence[Signals]) -> dict[str, object]:
-    """What of map, motor and thrust a rig with command and angle alone shows: the static lift of a duty, and its lag.
+    """The static lift of a duty and its lag: all that command and angle alone show of map, motor and thrust.
+
+    Args:
+        model: the identified model.
+        recordings: give the largest duty.
 
     Returns:
-        `duty` (K,) up to the largest there was; `rad_per_s2` (K,) the lift over the arm's inertia; `dead_zone`, the
-        duty below which there is none; `lag_s`, the rotor's time constant at half of the largest duty.
+        `duty` (K,) up to the largest; `rad_per_s2` (K,) lift over the arm's inertia; `dead_zone`, the duty below which
+        there is none; `lag_s`, the rotor's time constant at half of the largest duty.
     """
     n = model.numbers()
     duty = np.linspace(0.0, max(float(s.duty.max()) for s in recordings), CURVE)
@@ -349,13 +356,14 @@ def lift(model: Model, recordings: Sequence[Signals]) -> dict[str, object]:
 
 
 def _curve(numbers: Mapping[str, float], dead: float, bend: float, load: float, lag: float) -> dict[str, float]:
-    """Numbers of a map and motor.
+    """Parameters of a map and motor with a given static curve and lag.
 
     Args:
-        numbers: give the rest. dead: duty below which nothing turns.
-        bend: k3/k2; the map is a root of the duty if it is small, straight if it is large.
-        load: voltage that the load takes over that of the back-EMF, at full duty.
-        lag: s, of the rotor at full duty.
+        numbers: the rest.
+        dead: duty below which the rotor stands.
+        bend: k3/k2; small: a root of the duty; large: a straight line.
+        load: ratio of the voltages for load and back-EMF at full duty.
+        lag: [s] of the rotor at full duty.
     """
     n = dict(numbers)
     root = FULL / (math.sqrt(1.0 + bend) - math.sqrt(dead + bend))
@@ -369,8 +377,8 @@ def _curve(numbers: Mapping[str, float], dead: float, bend: float, load: float, 
 
 
 def _lift(model: Model, s: Signals) -> Array:
-    """Thrust (N,) that the duty gives, over k_thrust: the speed squared, unless an effect of `SIZES` changes that."""
-    from scipy.signal import lfilter  # takes long to import
+    """Thrust (N,) over k_thrust for a duty: the speed squared, unless an effect of `SIZES` changes that."""
+    from scipy.signal import lfilter  # its import is slow
 
     n = model.numbers()
     hangs = abs(float(np.mean(s.theta[np.isfinite(s.theta)][:3]))) < HANGS
@@ -387,14 +395,22 @@ def _lift(model: Model, s: Signals) -> Array:
 
 
 class _WeakForm:
-    """θ̈ = -G sin θ - c θ̇ + g u times bumps φ, integrated by parts: ∫ θ φ'' = ∫ (-G sin θ + g u) φ + c ∫ θ φ'."""
+    """The weak form of θ̈ = -G sin θ - c θ̇ + g u, for a linear regression of G, c and g.
+
+    With test functions φ: ∫ θ φ'' = ∫ (-G sin θ + g u) φ + c ∫ θ φ' (D. Messenger and D. Bortz, Multiscale Modeling &
+    Simulation 19, 2021). `identification.weak` does the same for a library of terms; here the input u is replaced for
+    each curve that is tried while the other columns stay.
+
+    Args:
+        s: angle and duty of a recording.
+    """
 
     def __init__(self, s: Signals) -> None:
         known = np.flatnonzero(np.isfinite(s.theta))
         theta = np.interp(np.arange(len(s)), known, s.theta[known])[:s.train]
         self.rows, self.kernels, left = [], [], []
         columns: list[list[Array]] = [[], [], []]
-        for half in BUMPS:
+        for half in TEST_FUNCTIONS:
             width = max(round(half / s.period), 3)
             z = np.arange(-width, width + 1) / width
             bump = (1.0 - z * z) ** 4
@@ -413,12 +429,12 @@ class _WeakForm:
         self.columns = [np.concatenate(c) for c in columns]
 
     def of(self, u: Array) -> Array:
-        """∫ u φ for each bump (M,)."""
+        """∫ u φ for each test function (M,)."""
         return np.concatenate([np.convolve(u, k[::-1], "same")[r] for r, k in zip(self.rows, self.kernels)])
 
 
 def _regress(tests: Sequence[_WeakForm], lifts: Sequence[Array]) -> tuple[float, Array]:
-    """Sum of squares left, and gravity, damping, gain; a constant takes what an angle that hangs elsewhere adds."""
+    """Sum of squares left, and gravity, damping, gain; a constant stands for the zero of the angle."""
     a = np.concatenate([np.column_stack([*w.columns[:2], w.of(u), w.columns[2]]) for w, u in zip(tests, lifts)])
     b = np.concatenate([w.left for w in tests])
     scale = np.maximum(np.linalg.norm(a, axis=0), 1e-300)

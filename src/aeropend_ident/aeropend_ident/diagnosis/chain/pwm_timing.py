@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When a duty begins to act: at the sample that first reports it, or half a period before.
+"""When a duty begins to act: at the sample that first reports it, or half a sample period before.
 
-A phase-correct PWM is sampled at the bottom of its count and takes a new duty at the top (ATmega2560 data sheet,
-17.9.4), so a sample reports a duty that has been acting for half a period, and will be for another half. The voltage,
-read at the same instants, does not show it; the current in between does. This is a matter of the board, not a gap of
-the model: it is told from the recording before effects are looked for, and given to the model as a `command_delay`
-below zero.
+A phase-correct PWM takes a new duty at the top of its count (ATmega2560 data sheet, 17.9.4). A board that samples at
+the bottom reports the duty half a period after it began to act. The voltage at the samples does not show that; the
+current in between does. This is a property of the board and not a gap of the model: it is estimated before effects are
+searched, and the model is given a negative `command_delay`.
 """
 
 from __future__ import annotations
@@ -15,73 +14,82 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis.chain.chain import DELAY, Chain, Chains
-from aeropend_ident.diagnosis.chain.priors import initial_unknowns, number_unknowns
-from aeropend_ident.diagnosis.search.hypotheses import MISMATCH_SD
-from aeropend_ident.estimation.map_fit import Unknown, fit
+from aeropend_ident.diagnosis.chain.chain import DELAY, CutChain, CutChains
+from aeropend_ident.diagnosis.chain.priors import initial_states, model_parameters
+from aeropend_ident.estimation.map_fit import fit
+from aeropend_ident.estimation.parameter import Parameter
 from aeropend_sim.model.parameters import Model
 
 Array = NDArray[np.float64]
 
+WIDE_SD = 0.3
+"""Relative standard deviation of a parameter that may be far off, so that it does not bias the timing (choice)."""
+
 HINT, CERTAIN = 0.3, 0.6
-"""Share of an early duty's mark on the current that makes it worth a closer look, and that leaves no doubt."""
+"""Share of an early duty's effect on the current that calls for a fit, and that is conclusive.
+
+The share is about 0 or about 1; the limits lie between (choice)."""
 
 
-def timed(chains: Chains) -> Chains:
-    """The chains, with the duty acting half a period earlier where the current says that it does."""
+def with_pwm_timing(chains: CutChains) -> CutChains:
+    """The chains, with the duty acting half a sample period earlier if the current shows that it does."""
     model = chains.model
-    if "command_delay" in model.effects or not all(s.has("v_a") and s.has("i_a") for _, s in chains.named()):
+    if "command_delay" in model.effects or not all(s.has("v_a") and s.has("i_a") for s in chains.recordings):
         return chains
     lead = 0.5 * chains.each[0].signals.period
-    note = (f"the duty acts {1e3 * lead:.2f} ms before the sample that first reports it, as a phase-correct PWM takes "
-            f"it: the model is given a command_delay of {-1e3 * lead:.2f} ms")
+    note = (f"the duty acts {1e3 * lead:.2f} ms before the sample that first reports it, as with a phase-correct PWM: "
+            f"the model is given a command_delay of {-1e3 * lead:.2f} ms")
     early = _copy(chains, model.with_effects({**model.effects, "command_delay": {"delay": -lead}}), note)
-    if mark(chains, early, {}) < HINT:
+    if early_share(chains, early, {}) < HINT:
         return chains
     at_sample = _copy(chains, model)
-    described = fit(chains.residuals("actuator"), _free(number_unknowns(chains, "actuator")))
-    at_sample.feed_next("actuator", described.values)
-    early.feed_next("actuator", described.values)
-    values = fit(at_sample.residuals("motor"), [*initial_unknowns(chains, "motor"),
-                                                *_free(number_unknowns(chains, "motor"))]).values
-    if mark(at_sample, early, values) < CERTAIN or any(_delayed(chain) for chain in chains.each):
+    described = fit(chains.residuals("actuator"), _widened(model_parameters(chains, "actuator")))
+    at_sample.set_next_input("actuator", described.values)
+    early.set_next_input("actuator", described.values)
+    values = fit(at_sample.residuals("motor"), [*initial_states(chains, "motor"),
+                                                *_widened(model_parameters(chains, "motor"))]).values
+    if early_share(at_sample, early, values) < CERTAIN or any(_delayed(chain) for chain in chains.each):
         return chains
     return _copy(chains, early.model, note)
 
 
-def mark(at_sample: Chains, early: Chains, values: dict[str, float]) -> float:
-    """How much of what an early duty would do to the current is in it, least squares: about 0 or about 1.
+def early_share(at_sample: CutChains, early: CutChains, values: dict[str, float]) -> float:
+    """Least-squares share of the change of the current by an early duty that the recordings show: about 0 or 1.
 
-    Both are taken against the mean of their neighbours in time, where hardly anything else leaves a trace.
+    Each sample is compared with the mean of its two neighbours, which removes most other influences.
+
+    Args:
+        at_sample: the chains with the duty acting at the sample.
+        early: the chains with the duty acting half a period earlier.
+        values: parameters and initial states of the motor.
     """
     expected, seen = [], []
     for k, (chain, other) in enumerate(zip(at_sample.each, early.each, strict=True)):
-        own = at_sample.own(values, k)
+        own = at_sample.values_of(values, k)
         current = chain.motor(own)[0]
-        expected.append(_against_neighbours(other.motor(own)[0] - current))
-        seen.append(_against_neighbours(chain.signals.i_a - current))
+        expected.append(_from_neighbours(other.motor(own)[0] - current))
+        seen.append(_from_neighbours(chain.signals.i_a - current))
     x, y = np.concatenate(expected), np.concatenate(seen)
     known = np.isfinite(y)
     power = float(x[known] @ x[known])
     return float(x[known] @ y[known]) / power if power > 0.0 else 0.0
 
 
-def _against_neighbours(x: Array) -> Array:
+def _from_neighbours(x: Array) -> Array:
     return x[1:-1] - 0.5 * (x[2:] + x[:-2])
 
 
-def _copy(chains: Chains, model: Model, *notes: str) -> Chains:
-    signals = [replace(s, notes=(*s.notes, *notes)) for s in chains.recordings]
-    return Chains(model, signals, fit_nominal=chains.fit_nominal)
+def _copy(chains: CutChains, model: Model, *notes: str) -> CutChains:
+    return type(chains)(model, [s.noted(*notes) for s in chains.recordings], chains.policy)
 
 
-def _free(numbers: list[Unknown]) -> list[Unknown]:
-    """Numbers that may be far off, lest a wrong one speaks for a wrong time."""
-    return [u if u.log else replace(u, sd=MISMATCH_SD * abs(u.mean)) for u in numbers]
+def _widened(parameters: list[Parameter]) -> list[Parameter]:
+    """The parameters with priors so wide that a wrong one does not bias the timing."""
+    return [p if p.log else replace(p, sd=WIDE_SD * abs(p.mean)) for p in parameters]
 
 
-def _delayed(chain: Chain) -> bool:
-    """Whether the voltage comes late by a sample or more: then the part of a period beyond looks like an early duty."""
+def _delayed(chain: CutChain) -> bool:
+    """Whether the voltage is late by a sample or more: the rest of its delay would look like an early duty."""
     def misfit(values: dict[str, float]) -> float:
         return sum(float(np.mean(r * r)) for r in chain.actuator_residuals(values).values())
 

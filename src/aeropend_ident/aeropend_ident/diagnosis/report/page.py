@@ -16,7 +16,6 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis.chain.chain import smooth
 from aeropend_ident.diagnosis.diagnosis import Diagnosis
 from aeropend_ident.diagnosis.report import curves
 from aeropend_ident.diagnosis.report.curves import HEIGHT, WIDTH
@@ -32,6 +31,7 @@ from aeropend_ident.diagnosis.report.number_format import (
     with_unit,
 )
 from aeropend_ident.signals.signals import CHANNELS, Signals
+from aeropend_ident.signals.smoothing import moving_mean
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH, PLACES
 from aeropend_sim.model.parameters import PARAMETERS
 
@@ -476,8 +476,8 @@ def _residuals(diagnosis: Diagnosis, doc: Any) -> list[dict[str, Any]]:
 
 def _misfit(diagnosis: Diagnosis, doc: Any) -> list[dict[str, Any]]:
     """What the nominal model leaves unexplained in the cut chain against each variable, with the regions named."""
-    misfit, regions = diagnosis.misfit["misfit"], doc["where"]["regions"]
-    against = {name: diagnosis.misfit[name] for name in AGAINST if _varies(diagnosis.misfit[name])}
+    misfit, regions = diagnosis.misfit.signal, doc["where"]["regions"]
+    against = {name: diagnosis.misfit.variables[name] for name in AGAINST if _varies(diagnosis.misfit.variables[name])}
     binned = {name: _binned(x, misfit, misfit) for name, x in against.items()}
     most = [float(np.nanmax(np.abs(lines[1:]))) for _, lines in binned.values() if np.isfinite(lines).any()]
     if not most or (doc["which"]["verdict"] == "none" and not regions):
@@ -525,7 +525,7 @@ def _variable(s: Signals, name: str) -> Array:
         return s.duty
     if name == "theta_dot":
         width = round(0.03 / s.period)
-        return np.gradient(smooth(smooth(s.theta, width), width), s.period)
+        return np.gradient(moving_mean(moving_mean(s.theta, width), width), s.period)
     return s.channel(name)
 
 

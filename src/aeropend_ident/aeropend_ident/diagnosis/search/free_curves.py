@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What something outside the catalogue looks like: at which place it acts, and its shape against each variable.
+"""Free curves: the shape of a missing term at each place of the chain, without an effect of the catalogue.
 
-At each place of the chain the missing term is taken as a sum of free curves, one a variable, drawn between knots: a
-voltage in the winding, a torque on the rotor, a force of the air, a torque on the arm, an error of a reading. Their
-effect on the readings is linear to first order, so each place is judged by one least-squares solve, with the numbers of
-the model refitted along. The place whose curves explain most is where the effect lives.
+At each place the missing term is a sum of piecewise linear curves, one of each variable: a voltage in the winding, a
+torque on the rotor, a force of the air, a torque on the arm, an error of a reading (a semi-parametric discrepancy). Its
+effect on the readings is linear to first order. So each place is judged by one least-squares solve, with the
+parameters of the model refitted along. The place whose curves explain most is the likeliest one.
 """
 
 from __future__ import annotations
@@ -12,45 +12,64 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis.chain.chain import Chain, Chains, mean_speed, of_recording
+from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
 from aeropend_ident.diagnosis.search.gauss_markov import transition
-from aeropend_ident.estimation.map_fit import Fit, Search, Unknown, independent_samples
+from aeropend_ident.estimation.map_fit import Fit, Search
+from aeropend_ident.estimation.parameter import Parameter, key, started
+from aeropend_ident.signals.pulses import mean_speed
 from aeropend_ident.signals.signals import Signals
+from aeropend_ident.signals.smoothing import lag
+from aeropend_ident.signals.statistics import effective_sample_size
 from aeropend_sim.compiled import njit
 from aeropend_sim.model import sensing
 
 Array = NDArray[np.float64]
 
 KNOTS = 9
-"""Knots of a curve, at quantiles of its variable."""
+"""Knots of a curve, at quantiles of its variable (choice: more draw noise, fewer miss a dead zone)."""
 
 STIFF = 1e-3
-"""Weight that keeps a curve from running off where no data holds it, in noise of a reading."""
+"""Weight of the prior on each value of a curve, per thousand samples: it holds a curve where there are no data."""
 
 MOMENT = 0.2
-"""s between knots of a term free in time."""
+"""[s] Distance of the knots of a term that is free in time (choice: shorter than the arm's period)."""
 
-AT_ANY_TIME = "any time"
+FREE_IN_TIME = "any time"
+"""Name of the variable of a term that is free in time."""
 
 MEMORY = 2.0
-"""s over which what the rotor did may still matter to the air."""
+"""[s] Time over which the air may remember what the rotor did (choice)."""
 
+SLOPE_OVER = 0.02
+"""[s] Lag over which slopes of speed and angle are taken: ten samples (choice)."""
+
+LATEST = 4
+"""Samples after a step of the duty that the voltage is given a value for (choice)."""
+
+CHANCE = 3.0
+"""Ratio of the share that curves explain of a residual to that of white noise above which it counts (choice)."""
 
 MOST_SAMPLES = 100_000
-"""Samples of training data in which shapes are sought: all their curves at once have to fit into memory."""
+"""Samples of training data in which missing terms are sought: all curves have to fit into memory at once."""
 
-MOST_AT_ANY_TIME = 25_000
-"""The same with a term free in time, whose knots grow with the time."""
+MOST_SAMPLES_FREE_IN_TIME = 25_000
+"""The same for a term that is free in time, whose knots grow with the time."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A free curve: `value` (K,), in `unit`, at `knot` (K,) of a variable."""
+    """A free curve.
+
+    Attributes:
+        variable: that it depends on.
+        unit: of its values.
+        knot: (K,) values of the variable.
+        value: (K,) values of the curve.
+    """
 
     variable: str
     unit: str
@@ -59,14 +78,17 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Shape:
-    """A missing term at a place.
+class MissingTerm:
+    """A missing term at a place of the chain.
 
     Attributes:
-        place: of the chain. curves: the term, as their sum.
-        left: mean square of what it leaves, in units of a reading's noise. before: the same without it.
-        samples: of all channels, that it was sought in. independent: how many independent ones that is worth.
-        left_of_chance: share of the mean square that it would leave of random torques on the arm, if it was asked.
+        place: of the chain.
+        curves: their sum is the term.
+        left: mean square residual with the term, in units of a reading's noise.
+        before: the same without it.
+        samples: number of readings in which it was sought.
+        ess: effective sample size of what it leaves.
+        left_of_random: share of the mean square of random torques on the arm that it would leave; NaN if not computed.
     """
 
     place: str
@@ -74,36 +96,55 @@ class Shape:
     left: float
     before: float
     samples: int
-    independent: float
-    left_of_chance: float = math.nan
+    ess: float
+    left_of_random: float = math.nan
 
     @property
     def explained(self) -> float:
-        """Mean square that the curves explain beyond what chance would let them."""
-        chance = 3.0 * sum(len(c.value) for c in self.curves) / self.samples
+        """Mean square that the curves explain beyond what they would explain of white noise."""
+        chance = CHANCE * sum(len(c.value) for c in self.curves) / self.samples
         return max(self.before - self.left - chance * self.before, 0.0)
 
 
-def hats(x: Array, count: int = KNOTS, train: int | None = None) -> tuple[Array, Array]:
-    """Piecewise linear basis (N, K) of a variable (N,), and its knots (K,) at quantiles of its first `train` values."""
-    known = x[:train][np.isfinite(x[:train])]
+def knots_of(x: Array, count: int = KNOTS) -> Array:
+    """Knots at quantiles of a variable.
+
+    Args:
+        x: (N,) values, NaN where missing.
+        count: of knots at most.
+
+    Returns:
+        (K,) increasing knots; empty if the variable takes too few values.
+    """
+    known = x[np.isfinite(x)]
     knots = np.unique(np.quantile(known, np.linspace(0.002, 0.998, count))) if len(known) else np.zeros(0)
     if len(knots) < 3:
-        return np.zeros((len(x), 0)), np.zeros(0)
+        return np.zeros(0)
     knots = knots[np.append(True, np.diff(knots) > 1e-3 * float(np.ptp(knots)))]
-    if len(knots) < 3:
-        return np.zeros((len(x), 0)), np.zeros(0)
+    return knots if len(knots) >= 3 else np.zeros(0)
+
+
+def hats(x: Array, knots: Array) -> Array:
+    """Piecewise linear basis (N, K) of a variable x (N,) at knots (K,)."""
+    if not len(knots):
+        return np.zeros((len(x), 0))
     filled = np.nan_to_num(x, nan=float(knots[0]))
-    return np.column_stack([np.interp(filled, knots, row) for row in np.eye(len(knots))]), knots
+    return np.column_stack([np.interp(filled, knots, row) for row in np.eye(len(knots))])
 
 
 @njit(nogil=True)
 def arm_response(drive: Array, stiffness: Array, damping: float, tau: float, h: float) -> Array:
-    """Change of the angle read (K, N) for torques over inertia (K, N), to first order.
+    """First-order response of the angle read to torques on the arm.
 
     Args:
-        drive: 1/s². stiffness: (N,) 1/s², of the arm where it is. damping: 1/s. tau: s, of each stage of the filter.
-        h: s.
+        drive: [rad/s²] (K, N) torques over inertia.
+        stiffness: [1/s²] (N,) of the arm at its angle.
+        damping: [1/s] of the arm.
+        tau: [s] time constant of each of the two stages of the angle's filter.
+        h: [s] sample period.
+
+    Returns:
+        [rad] (K, N).
     """
     out = np.empty_like(drive)
     keep = math.exp(-h / tau) if tau > 0.0 else 0.0
@@ -122,7 +163,24 @@ def arm_response(drive: Array, stiffness: Array, damping: float, tau: float, h: 
 @njit(nogil=True)
 def motor_response(voltage: Array, torque: Array, omega: Array, R_a: float, L_a: float, K_e: float, K_t: float,
                    J_m: float, B_m: float, k_load: float, h: float) -> tuple[Array, Array, Array]:
-    """Change of current, speed and rotor angle (K, N) for voltages (V) and torques (N·m) (K, N), to first order."""
+    """First-order response of the motor to voltages in the winding and torques on the rotor.
+
+    Args:
+        voltage: [V] (K, N).
+        torque: [N·m] (K, N).
+        omega: [rad/s] (N,) speed around which the motor is linear.
+        R_a: [Ω] winding resistance.
+        L_a: [H] winding inductance.
+        K_e: [V·s/rad] back-EMF constant.
+        K_t: [N·m/A] torque constant.
+        J_m: [kg·m²] rotor inertia.
+        B_m: [N·m·s/rad] viscous friction.
+        k_load: [N·m·s²/rad²] aerodynamic load.
+        h: [s] sample period.
+
+    Returns:
+        [A] current, [rad/s] speed and [rad] rotor angle, (K, N) each.
+    """
     i_out, w_out, angle_out = np.empty_like(voltage), np.empty_like(voltage), np.empty_like(voltage)
     decay = math.exp(-h * R_a / L_a)
     for j in range(voltage.shape[0]):
@@ -139,11 +197,50 @@ def motor_response(voltage: Array, torque: Array, omega: Array, R_a: float, L_a:
     return i_out, w_out, angle_out
 
 
-def _slow(x: Array, tau: float, h: float) -> Array:
-    """First-order lag (N,) of a series."""
-    return _lagged(np.ascontiguousarray(x), math.exp(-h / tau))
+Columns = list[tuple[str, str, Array, Array]]
+"""Curves at a place before they are fitted: variable, unit, knots (K,), columns (K, N)."""
+
+Places = dict[str, tuple[Columns, dict[str, Array]]]
+"""Place -> its curves, and the response (K, N) of each channel to all of them."""
+
+Variables = Mapping[str, Array]
+"""Variable of curves -> (N,)."""
 
 
+@dataclass(frozen=True)
+class _Stage:
+    """The curves in a stage of the chain of one recording.
+
+    Attributes:
+        chain: of the recording.
+        values: of the fit that the curves are added to.
+        variables: (N,) by name.
+        knots: (K,) by name.
+        any_time: whether to add a term that is free in time.
+    """
+
+    chain: CutChain
+    values: Mapping[str, float]
+    variables: Variables
+    knots: Mapping[str, Array]
+    any_time: bool
+
+    def curves(self, names: Sequence[str], unit: str, factor: Array | float = 1.0, said: str = "") -> Columns:
+        """Curves of some variables, times a factor; `said` is added to their names."""
+        return [(name + said, unit, self.knots[name],
+                 np.ascontiguousarray(hats(self.variables[name], self.knots[name]).T * factor)) for name in names]
+
+    def free_in_time(self, unit: str) -> Columns:
+        """A term that is free in time: it shows which place fits, whatever the term depends on."""
+        s = self.chain.signals
+        t = np.arange(len(s)) * s.period
+        knots = np.arange(0.0, s.train * s.period + MOMENT, MOMENT)
+        first = np.searchsorted(t, knots - MOMENT)
+        last = np.searchsorted(t, knots + MOMENT)
+        columns = np.zeros((len(knots), len(s)))
+        for j, (a, b) in enumerate(zip(first, last, strict=True)):
+            columns[j, a:b] = np.maximum(1.0 - np.abs(t[a:b] - knots[j]) / MOMENT, 0.0)
+        return [(FREE_IN_TIME, unit, knots, columns)]
 @njit(nogil=True)
 def _lagged(x: Array, keep: float) -> Array:
     out = np.empty_like(x)
@@ -154,25 +251,12 @@ def _lagged(x: Array, keep: float) -> Array:
     return out
 
 
-Block = list[tuple[str, str, Array, Array]]
-"""Curves at a place before they are weighed: variable, unit, knots (K,), columns (K, N)."""
+def _stacked(columns: Columns) -> Array:
+    return np.concatenate([c for *_, c in columns])
 
 
-Places = dict[str, list[tuple[Block, dict[str, Array]]]]
-"""Place -> its curves and the response of each channel to them."""
-
-
-def _curves(train: int, variables: Mapping[str, NDArray[Any]], unit: str, factor: Array | float = 1.0, said: str = ""
-            ) -> Block:
-    found: Block = []
-    for name, x in variables.items():
-        basis, knots = hats(x, train=train)
-        found.append((name + said, unit, knots, np.ascontiguousarray(basis.T * factor)))
-    return found
-
-
-def _driven(chain: Chain, values: Mapping[str, float], drive: Array) -> dict[str, Array]:
-    """Response of the angle (K, N) to torques over inertia (K, N)."""
+def angle_response(chain: CutChain, values: Mapping[str, float], drive: Array) -> dict[str, Array]:
+    """Response (K, N) of the angle to torques over inertia (K, N), by channel."""
     model = chain.valued(values)
     n = model.numbers()
     tau = model.sensing["angle_filter_tau"] + model.effects.get("encoder_lag", {}).get("tau", 0.0)
@@ -180,84 +264,87 @@ def _driven(chain: Chain, values: Mapping[str, float], drive: Array) -> dict[str
     return {"theta": arm_response(drive, stiffness, n["c_over_J"], tau, chain.signals.period)}
 
 
-def _arm(chain: Chain, values: Mapping[str, float], any_time: bool) -> Places:  # noqa: ARG001
+def _time(s: Signals) -> Array:
+    return np.asarray(np.arange(len(s)) * s.period, dtype=np.float64)
+
+
+def _arm_variables(chain: CutChain, values: Mapping[str, float]) -> Variables:
     s = chain.signals
-    model = chain.valued(values)
-    n = model.numbers()
     theta, rate = chain.arm_motion(values)
-    speed = chain.speed
-    force = n["L_over_J"] * n["k_thrust"] * speed**2
-    t = np.arange(len(s)) * s.period
+    return {"omega": chain.speed, "theta": theta, "theta_dot": rate, "t": _time(s),
+            "omega, slowly": lag(chain.speed, MEMORY, s.period),
+            "slope of omega": np.gradient(lag(chain.speed, SLOPE_OVER, s.period), s.period)}
 
-    def respond(block: Block) -> tuple[Block, dict[str, Array]]:
-        return block, _driven(chain, values, np.concatenate([columns for *_, columns in block]))
 
-    thrust = [*_curves(s.train, {"omega": speed}, "rad/s²"),
-              *_curves(s.train, {"theta": theta}, "-", force, " (share of the thrust)"),
-              *_curves(s.train, {"theta_dot": rate}, "-", force, " (share of the thrust)"),
-              *_curves(s.train, {"omega, slowly": _slow(speed, MEMORY, s.period)}, "-", force,
-                       " (share of the thrust)"),
-              *_curves(s.train, {"slope of omega": np.gradient(_slow(speed, 0.02, s.period), s.period)}, "rad/s²")]
-    arm = [*_curves(s.train, {"theta": theta, "theta_dot": rate, "t": t}, "rad/s²"),
-           *_curves(s.train, {"theta": theta}, "1/s", rate, " (damping)")]
-    shown = [*_curves(s.train, {"theta": theta}, "rad"), *_curves(s.train, {"theta_dot": rate}, "rad")]
+def _arm(stage: _Stage) -> Places:
+    chain, s = stage.chain, stage.chain.signals
+    model = chain.valued(stage.values)
+    n = model.numbers()
+    rate = stage.variables["theta_dot"]
+    force = n["L_over_J"] * n["k_thrust"] * chain.speed**2
+    share = " (share of the thrust)"
+    thrust = [*stage.curves(["omega"], "rad/s²"), *stage.curves(["theta"], "-", force, share),
+              *stage.curves(["theta_dot"], "-", force, share), *stage.curves(["omega, slowly"], "-", force, share),
+              *stage.curves(["slope of omega"], "rad/s²")]
+    arm = [*stage.curves(["theta", "theta_dot", "t"], "rad/s²"), *stage.curves(["theta"], "1/s", rate, " (damping)")]
+    shown = stage.curves(["theta", "theta_dot"], "rad")
     reading = sensing.prepare(model.with_effects({}), s.period)
     columns = np.array([sensing.angle_reading(np.ascontiguousarray(c), np.gradient(c, s.period), reading)
-                        for *_, block in shown for c in block])
-    return {"thrust": [respond(thrust)], "arm": [respond(arm)], "sensing": [(shown, {"theta": columns})]}
+                        for c in _stacked(shown)])
+    return {"thrust": (thrust, angle_response(chain, stage.values, _stacked(thrust))),
+            "arm": (arm, angle_response(chain, stage.values, _stacked(arm))), "sensing": (shown, {"theta": columns})}
 
 
-def _motor(chain: Chain, values: Mapping[str, float], any_time: bool) -> Places:
+def _motor_variables(chain: CutChain, values: Mapping[str, float]) -> Variables:
     s = chain.signals
-    n = chain.valued(values).numbers()
     i, omega, _ = chain.motor(values)
-    t = np.arange(len(s)) * s.period
-    theta = np.nan_to_num(_slow(np.nan_to_num(s.theta), 0.02, s.period))
+    return {"i_a": i, "omega": omega, "t": _time(s),
+            "theta": np.nan_to_num(lag(np.nan_to_num(s.theta), SLOPE_OVER, s.period))}
 
-    def respond(block: Block, volts: bool) -> tuple[Block, dict[str, Array]]:
-        drive = np.concatenate([columns for *_, columns in block])
+
+def _motor(stage: _Stage) -> Places:
+    n = stage.chain.valued(stage.values).numbers()
+    i, omega = stage.variables["i_a"], stage.variables["omega"]
+
+    def response(columns: Columns, *, volts: bool) -> dict[str, Array]:
+        drive = _stacked(columns)
         nothing = np.zeros_like(drive)
         out = motor_response(*((drive, nothing) if volts else (nothing, drive)), omega, n["R_a"], n["L_a"], n["K_e"],
-                             n["K_t"], n["J_m"], n["B_m"], n["k_load"], s.period)
-        return block, dict(zip(("i_a", "omega", "angle"), out, strict=True))
+                             n["K_t"], n["J_m"], n["B_m"], n["k_load"], stage.chain.signals.period)
+        return dict(zip(("i_a", "omega", "angle"), out, strict=True))
 
-    electrical = [*_curves(s.train, {"i_a": i, "omega": omega, "t": t}, "V"),
-                  *_curves(s.train, {"omega": omega, "t": t}, "Ω", i, " (resistance)")]
-    rotor = [*_curves(s.train, {"omega": omega, "theta": theta, "t": t}, "N·m"), *_curves(s.train, {"i_a": i}, "N·m")]
-    shown = [*_curves(s.train, {"i_a": i, "t": t, "omega": omega}, "A")]
-    if any_time:
-        electrical += _any_time(s, "V")
-        rotor += _any_time(s, "N·m")
-        shown += _any_time(s, "A")
-    columns = np.concatenate([c for *_, c in shown])
-    return {"electrical": [respond(electrical, volts=True)], "rotor": [respond(rotor, volts=False)],
-            "sensing": [(shown, {"i_a": columns})]}
-
-
-def _any_time(s: Signals, unit: str) -> Block:
-    """A term free in time, between knots `MOMENT` apart: it asks which place fits, whatever the term depends on."""
-    t = np.arange(len(s)) * s.period
-    knots = np.arange(0.0, s.train * s.period + MOMENT, MOMENT)
-    first = np.searchsorted(t, knots - MOMENT)
-    last = np.searchsorted(t, knots + MOMENT)
-    columns = np.zeros((len(knots), len(s)))
-    for j, (a, b) in enumerate(zip(first, last, strict=True)):
-        columns[j, a:b] = np.maximum(1.0 - np.abs(t[a:b] - knots[j]) / MOMENT, 0.0)
-    return [(AT_ANY_TIME, unit, knots, columns)]
+    electrical = [*stage.curves(["i_a", "omega", "t"], "V"),
+                  *stage.curves(["omega", "t"], "Ω", i, " (resistance)")]
+    rotor = stage.curves(["omega", "theta", "t", "i_a"], "N·m")
+    shown = stage.curves(["i_a", "t", "omega"], "A")
+    if stage.any_time:
+        electrical += stage.free_in_time("V")
+        rotor += stage.free_in_time("N·m")
+        shown += stage.free_in_time("A")
+    return {"electrical": (electrical, response(electrical, volts=True)),
+            "rotor": (rotor, response(rotor, volts=False)), "sensing": (shown, {"i_a": _stacked(shown)})}
 
 
-def _actuator(chain: Chain, values: Mapping[str, float], any_time: bool) -> Places:  # noqa: ARG001
+def _actuator_variables(chain: CutChain, values: Mapping[str, float]) -> Variables:  # noqa: ARG001
     s = chain.signals
-    t = np.arange(len(s)) * s.period
-    i = np.nan_to_num(s.i_a)
-    late = {f"step of the duty, {k} samples ago": np.roll(np.diff(s.duty, prepend=s.duty[0]), k) for k in range(4)}
-    block = [*_curves(s.train, {"duty": s.duty, "i_a": i, "t": t}, "V"),
-             *[(name, "V", np.array([1.0]), x[None, :]) for name, x in late.items()]]
-    return {"actuator": [(block, {"v_a": np.concatenate([c for *_, c in block])})]}
+    return {"duty": s.duty, "i_a": np.nan_to_num(s.i_a), "t": _time(s)}
 
 
-def _rows(chain: Chain, channel: str, response: Mapping[str, Array], count: int) -> Array:
-    """Response (K, M) in the rows of a channel's residual, in units of its noise; zero where it does not show."""
+def _actuator(stage: _Stage) -> Places:
+    s = stage.chain.signals
+    late = {f"step of the duty, {k} samples ago": np.roll(np.diff(s.duty, prepend=s.duty[0]), k) for k in range(LATEST)}
+    columns = [*stage.curves(["duty", "i_a", "t"], "V"),
+               *[(name, "V", np.array([1.0]), x[None, :]) for name, x in late.items()]]
+    return {"actuator": (columns, {"v_a": _stacked(columns)})}
+
+
+_OF_STAGE: dict[str, tuple[Callable[[CutChain, Mapping[str, float]], Variables], Callable[[_Stage], Places]]] = {
+    "actuator": (_actuator_variables, _actuator), "motor": (_motor_variables, _motor), "arm": (_arm_variables, _arm)}
+"""Stage -> the variables of its curves, and the curves at its places."""
+
+
+def _rows(chain: CutChain, channel: str, response: Mapping[str, Array], count: int) -> Array:
+    """Response (K, M) in the rows of a channel's residual, in units of its noise; zero where it does not act."""
     s = chain.signals
     if channel == "omega" and s.pulses is not None:
         p = s.pulses
@@ -273,47 +360,50 @@ def _rows(chain: Chain, channel: str, response: Mapping[str, Array], count: int)
     return response[channel][:, start:s.train][:, known] / s.sigma[channel]
 
 
-def shapes(chains: Chains, block: str, base: Fit, known: Sequence[Unknown], *, any_time: bool = False,
-           torques: Callable[[int], Array] | None = None) -> list[Shape]:
-    """The missing term at each place of a part of the chain, the place that explains most first.
+def missing_terms(chains: CutChains, stage: str, base: Fit, known: Sequence[Parameter], *, any_time: bool = False,
+                  torques: Callable[[int], Array] | None = None) -> list[MissingTerm]:
+    """The missing term at each place of a stage, the place that explains most first.
 
     Args:
-        chains: cut. block: the part. base: a fit of it. known: the unknowns of that fit that are refitted along.
-        any_time: weigh the places of the motor with a term free in time besides (a second or two).
-        torques: makes random torques on the arm (D, N), rad/s², of N samples: what of them each place would leave.
+        chains: cut.
+        stage: of the chain.
+        base: a fit of the stage.
+        known: the parameters of that fit that are refitted along.
+        any_time: add a term that is free in time at each place of the motor.
+        torques: makes random torques over inertia (D, N), [rad/s²], of N samples; the share of them that the curves of
+            each place would leave is computed.
     """
-    chains = chains.head(MOST_AT_ANY_TIME if any_time else MOST_SAMPLES)
-    begun = [Unknown(u.name, u.mean, u.sd, u.low, u.high, base.values[u.name], u.log) for u in known
-             if of_recording(u.name)[1] < len(chains.each)]
-    residuals = chains.residuals(block)
-    search = Search(lambda values: residuals({**base.values, **values}), begun)
+    chains = chains.head(MOST_SAMPLES_FREE_IN_TIME if any_time else MOST_SAMPLES)
+    here = [p for p in known if key(p.name).recording < len(chains.each)]
+    residuals = chains.residuals(stage)
+    search = Search(lambda values: residuals({**base.values, **values}), started(here, base.values))
     jacobian = search.stacked(search.jacobian())
     weight = np.concatenate([np.full(len(r), w) for r, w in ((search.current[k], search.weight[k])
                                                              for k in search.weight)])
     jacobian = jacobian / weight
     r = np.concatenate([search.current[k] for k in search.weight])
     before = float(np.mean(r * r))
-    makers: dict[str, Callable[[Chain, Mapping[str, float], bool], Places]] = {
-        "arm": _arm, "motor": _motor, "actuator": _actuator}
-    made = [makers[block](chain, chains.own(base.values, k), any_time) for k, chain in enumerate(chains.each)]
-    chance = None
+    values = [chains.values_of(base.values, k) for k in range(len(chains.each))]
+    variables_of, places_of = _OF_STAGE[stage]
+    variables = [variables_of(chain, own) for chain, own in zip(chains.each, values, strict=True)]
+    knots = [{name: knots_of(x[:chain.signals.train]) for name, x in v.items()}
+             for v, chain in zip(variables, chains.each, strict=True)]
+    made = [places_of(_Stage(chain, own, v, at, any_time))
+            for chain, own, v, at in zip(chains.each, values, variables, knots, strict=True)]
+    random = None
     if torques is not None:
-        moved = [_driven(chain, chains.own(base.values, k), torques(len(chain.signals)))
-                 for k, chain in enumerate(chains.each)]
-        chance = np.concatenate([_rows(chains.each[k], channel, moved[k], len(moved[k]["theta"]))
-                                 for channel, k in map(of_recording, search.weight)], axis=1)
+        moved = [angle_response(chain, own, torques(len(chain.signals)))
+                 for chain, own in zip(chains.each, values, strict=True)]
+        random = np.concatenate([_rows(chains.each[k.recording], k.name, moved[k.recording],
+                                       len(moved[k.recording]["theta"])) for k in map(key, search.weight)], axis=1)
     found = []
-    for place in made[0]:
-        curves = made[0][place][0][0]
+    for place, (curves, _) in made[0].items():
         count = sum(len(c) for *_, c in curves)
-        if any(sum(len(c) for *_, c in own[place][0][0]) != count for own in made):
+        if any(sum(len(c) for *_, c in own[place][0]) != count for own in made):
             made = made[:1]
-        columns = []
-        for name in search.weight:
-            channel, k = of_recording(name)
-            columns.append(-_rows(chains.each[k], channel, made[k][place][0][1], count) if k < len(made)
-                           else np.zeros((count, len(search.current[name]))))
-        basis = np.concatenate(columns, axis=1)
+        basis = np.concatenate([-_rows(chains.each[k.recording], k.name, made[k.recording][place][1], count)
+                                if k.recording < len(made) else np.zeros((count, len(search.current[name])))
+                                for name, k in ((name, key(name)) for name in search.weight)], axis=1)
         size = np.maximum(np.sqrt(np.mean(basis**2, axis=1)), 1e-12)
         rows = np.vstack([jacobian, basis / size[:, None]])
         information = rows @ rows.T + np.diag([*np.ones(len(jacobian)), *np.full(count, STIFF * len(r) / 1e3)])
@@ -321,15 +411,20 @@ def shapes(chains: Chains, block: str, base: Fit, known: Sequence[Unknown], *, a
         solution = -np.linalg.solve(information, pull)
         rest = r + rows.T @ solution
         left = float(np.mean(rest * rest))
-        values, drawn = solution[len(jacobian):] / size, []
-        at = 0
-        for variable, unit, knots, c in curves:
-            if variable != AT_ANY_TIME:
-                drawn.append(Curve(variable, unit, knots, values[at:at + len(c)]))
-            at += len(c)
-        of_chance = math.nan
-        if chance is not None:
-            spared = chance.T - rows.T @ np.linalg.solve(information, rows @ chance.T)
-            of_chance = float(np.mean(spared**2) / np.mean(chance**2))
-        found.append(Shape(place, drawn, left, before, len(r), independent_samples(rest), of_chance))
-    return sorted(found, key=lambda shape: shape.left)
+        of_random = math.nan
+        if random is not None:
+            spared = random.T - rows.T @ np.linalg.solve(information, rows @ random.T)
+            of_random = float(np.mean(spared**2) / np.mean(random**2))
+        found.append(MissingTerm(place, _curves(curves, solution[len(jacobian):] / size), left, before, len(r),
+                                 effective_sample_size(rest), of_random))
+    return sorted(found, key=lambda term: term.left)
+
+
+def _curves(columns: Columns, values: Array) -> list[Curve]:
+    """The fitted curves of a place, without a term that is free in time."""
+    drawn, at = [], 0
+    for variable, unit, knots, c in columns:
+        if variable != FREE_IN_TIME:
+            drawn.append(Curve(variable, unit, knots, values[at:at + len(c)]))
+        at += len(c)
+    return drawn

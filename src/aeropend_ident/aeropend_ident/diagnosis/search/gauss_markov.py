@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A random torque on the arm, seen through the angle: a Gauss-Markov process tracked by a Kalman filter.
+"""A random torque on the arm, estimated from the angle: a Gauss-Markov process in a Kalman filter.
 
-No simulation can follow chance, so `gust` is judged by the statistics of what every simulation leaves. The smoothed
-torque also shows where in operation something unexplained pushes the arm.
+No simulation can follow a random torque, so the effect `gust` is judged by the statistics of the residual. The smoothed
+torque also shows in which range of operation an unexplained torque acts.
+
+Source: A. Bryson and Y.-C. Ho, Applied Optimal Control, 1975, chapters 11 to 13 (Gauss-Markov process, Kalman filter);
+H. Rauch, F. Tung and C. Striebel, AIAA Journal 3, 1965 (smoother).
 """
 
 from __future__ import annotations
@@ -13,20 +16,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from aeropend_ident.signals.smoothing import block_mean
 from aeropend_sim.compiled import njit
 
 Array = NDArray[np.float64]
 
 STEP = 0.01
-"""s between the residuals that the filter takes: the arm is slow."""
+"""[s] Time between the residuals that the filter takes: a fiftieth of the arm's usual period."""
 
 SETTLED = 1.0
-"""s after which the filter has forgotten that what moved the arm before the recording was not seen."""
+"""[s] Time after which the filter has forgotten its initial state (choice: some time constants of the arm)."""
 
-NOTHING = np.empty((0, 18))
+NOT_KEPT = np.empty((0, 18))
 
 FOLDS = 10
-"""Stretches of time, each predicted from the others."""
+"""Stretches of time in the cross-validation, each predicted from the others (convention: ten folds)."""
 
 
 @dataclass(frozen=True)
@@ -34,33 +38,50 @@ class Gust:
     """A Gauss-Markov torque fitted to a residual of the angle.
 
     Attributes:
-        sigma: rad/s², and tau: s, estimates. sigma_sd: relative, and tau_sd: likewise, of their logarithms.
-        likelihood: its logarithm. gain: the same over no torque but inflated white noise.
-        torque: (M,) rad/s², smoothed, at `index` (M,) of the samples.
-        heavy: mean fourth power of the filter's innovations over that of normal ones of the same variance; far above 1
-            the angle jumps, which no torque makes it do.
+        sigma: [rad/s²] standard deviation of the torque over the arm's inertia.
+        tau: [s] correlation time.
+        sigma_sd: standard deviation of the logarithm of sigma.
+        tau_sd: standard deviation of the logarithm of tau.
+        log_likelihood: of the residual.
+        gain: log likelihood over that of no torque with inflated white noise.
+        torque: [rad/s²] (M,) smoothed torque.
+        index: (M,) its samples.
+        kurtosis: fourth moment of the filter's innovations over that of a normal distribution: 1 for a random torque;
+            far above it the angle jumps, which no torque causes.
     """
 
     sigma: float
     tau: float
     sigma_sd: float
     tau_sd: float
-    likelihood: float
+    log_likelihood: float
     gain: float
     torque: Array
     index: NDArray[np.int64]
-    heavy: float
+    kurtosis: float
 
 
 @njit(nogil=True)
 def _filter(r: Array, stiffness: Array, damping: float, h: float, noise: float, sigma: float, tau: float,
             innovations: Array, kept: Array) -> float:
-    """Kalman filter over (δ, δ̇, w); returns the log likelihood.
+    """Kalman filter over the state (δ, δ̇, w): deviation of the angle, its rate, and the torque.
+
+    The 3 × 3 products are written out, since small arrays are slow in compiled code too.
 
     Args:
-        r, stiffness: (M,). innovations: (M,), filled, in units of their standard deviation.
-        kept: (M, 18) or (0, 18), filled with what the smoother needs: the state and covariance (row-wise) after each
-            measurement, and the state and covariance before it.
+        r: [rad] (M,) residual, NaN where missing.
+        stiffness: [1/s²] (M,) of the arm at its angle.
+        damping: [1/s] of the arm.
+        h: [s] between residuals.
+        noise: [rad] standard deviation of a residual.
+        sigma: [rad/s²] of the process.
+        tau: [s] of the process.
+        innovations: (M,) filled, in units of their standard deviation.
+        kept: (M, 18) or (0, 18), filled for the smoother: state and upper triangle of the covariance after each
+            measurement, and the same before it.
+
+    Returns:
+        Log likelihood, up to a constant.
     """
     x0 = x1 = x2 = 0.0
     p00, p01, p02, p11, p12, p22 = noise * noise, 0.0, 0.0, 0.01, 0.0, sigma * sigma
@@ -95,7 +116,16 @@ def _filter(r: Array, stiffness: Array, damping: float, h: float, noise: float, 
 
 @njit()
 def transition(stiffness: float, damping: float, h: float) -> tuple[float, float, float, float, float, float]:
-    """First two rows of the transition of (δ, δ̇, w) over h, to second order."""
+    """Transition of the linear arm over a step, to second order in the step.
+
+    Args:
+        stiffness: [1/s²] of the arm at its angle.
+        damping: [1/s] of the arm.
+        h: [s] step.
+
+    Returns:
+        First two rows of the transition matrix of (δ, δ̇, w).
+    """
     half = 0.5 * h * h
     return (1.0 - half * stiffness, h - half * damping, half,
             -h * stiffness + half * damping * stiffness, 1.0 - h * damping + half * (damping * damping - stiffness),
@@ -104,7 +134,7 @@ def transition(stiffness: float, damping: float, h: float) -> tuple[float, float
 
 @njit(nogil=True)
 def _smooth(kept: Array, stiffness: Array, damping: float, h: float, tau: float, torque: Array) -> None:
-    """Rauch-Tung-Striebel smoother; fills the torque (M,)."""
+    """Rauch-Tung-Striebel smoother over `kept` of the filter; fills `torque` [rad/s²] (M,)."""
     n = kept.shape[0]
     x = kept[n - 1, :3].copy()
     torque[n - 1] = x[2]
@@ -127,26 +157,27 @@ def symmetric(p: Array) -> Array:
 
 
 def fit_gust(residual: Array, theta: Array, gravity: float, damping: float, noise: float, period: float) -> Gust:
-    """Fit a Gauss-Markov torque to a residual.
+    """Fit a Gauss-Markov torque to a residual (maximum likelihood).
 
     Args:
-        residual: (N,) rad, measured minus simulated angle, NaN where missing.
-        theta: (N,) rad, the motion around which the arm is linear.
-        gravity: mgd/J, 1/s²; damping: c/J, 1/s. noise: rad, of a reading. period: s between samples.
+        residual: [rad] (N,) measured minus simulated angle, NaN where missing.
+        theta: [rad] (N,) motion around which the arm is linear.
+        gravity: [1/s²] mgd/J.
+        damping: [1/s] c/J.
+        noise: [rad] standard deviation of a reading.
+        period: [s] between samples.
     """
-    from scipy.optimize import minimize  # takes long to import
+    from scipy.optimize import minimize  # its import is slow
 
     every = max(1, round(STEP / period))
     n = len(residual) // every
-    blocks = residual[: n * every].reshape(n, every)
-    count = np.isfinite(blocks).sum(axis=1)
-    r = np.where(count > 0, np.nansum(blocks, axis=1) / np.maximum(count, 1), np.nan)
+    r = block_mean(residual, every)
     index = np.arange(n) * every + every // 2
     stiffness = gravity * np.cos(np.nan_to_num(theta[index]))
     h, sd = every * period, noise / math.sqrt(every)
     torque, innovations = np.zeros(n), np.zeros(n)
 
-    def cost(z: Array, kept: Array = NOTHING) -> float:
+    def cost(z: Array, kept: Array = NOT_KEPT) -> float:
         return -_filter(r, stiffness, damping, h, sd, math.exp(z[0]), math.exp(z[1]), innovations, kept)
 
     size = float(np.nanstd(r)) * (gravity + 1.0)
@@ -167,13 +198,20 @@ def fit_gust(residual: Array, theta: Array, gravity: float, damping: float, nois
     cost(z, kept)
     _smooth(kept, stiffness, damping, h, math.exp(z[1]), torque)
     e = innovations[min(round(SETTLED / h), n // 2):]
-    heavy = float(np.mean(e**4) / (3.0 * max(float(np.mean(e * e)), 1e-150) ** 2))
+    kurtosis = float(np.mean(e**4) / (3.0 * max(float(np.mean(e * e)), 1e-150) ** 2))
     return Gust(math.exp(z[0]), math.exp(z[1]), width[0], width[1], -best.fun, -best.fun - without, torque.copy(),
-                index, heavy)
+                index, kurtosis)
 
 
 def gauss_markov(shape: tuple[int, int], tau: float, period: float, rng: np.random.Generator) -> Array:
-    """Random torques (D, N) of that shape, each of variance 1, correlated over tau, s; period: s between samples."""
+    """Draw random torques of variance 1.
+
+    Args:
+        shape: (D, N) number of torques and of samples.
+        tau: [s] correlation time.
+        period: [s] between samples.
+        rng: source of random numbers.
+    """
     return _correlated(rng.standard_normal(shape), math.exp(-period / tau))
 
 
@@ -187,10 +225,14 @@ def _correlated(white: Array, keep: float) -> Array:
 
 
 def follows_state(torque: Array, columns: Array) -> float:
-    """Share of the torque's variance (up to 1) that a linear combination of columns predicts where it was not fitted.
+    """Share of a torque's variance that a linear combination of columns predicts in cross-validation.
 
     Args:
-        torque: (M,). columns: (M, K).
+        torque: (M,).
+        columns: (M, K).
+
+    Returns:
+        At most 1; negative where the prediction is worse than the mean.
     """
     a = np.column_stack([np.ones(len(torque)), columns])
     a = a / np.maximum(np.linalg.norm(a, axis=0), 1e-12)

@@ -1,104 +1,132 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether what a model leaves of the arm is a random torque, `gust`, which no fit of the cut chain can follow."""
+"""The effect `gust`: whether the rest of the arm is a random torque, which no fit of the cut chain can follow."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis.chain.chain import Chains, with_values
-from aeropend_ident.diagnosis.chain.priors import nominal_unknowns
-from aeropend_ident.diagnosis.search.free_curves import hats, shapes
+from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.priors import nominal_parameters
+from aeropend_ident.diagnosis.chain.values import with_values
+from aeropend_ident.diagnosis.policy import GOOD_ENOUGH
+from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis, drop_unneeded
+from aeropend_ident.diagnosis.search.free_curves import hats, knots_of, missing_terms
 from aeropend_ident.diagnosis.search.gauss_markov import Gust, fit_gust, follows_state, gauss_markov
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
-from aeropend_ident.diagnosis.search.search import Findings, drop_unneeded, refit
-from aeropend_ident.diagnosis.search.selection import GOOD_ENOUGH, Weighed, counts_of
-from aeropend_ident.estimation.map_fit import Fit, Unknown
+from aeropend_ident.diagnosis.search.search import refit
+from aeropend_ident.estimation.map_fit import Fit, estimate, largest_ess
 from aeropend_ident.signals.signals import Signals
 
 Array = NDArray[np.float64]
 
 RANDOM = 0.35
-"""A torque on the arm passes as random while the state predicts less than this share of it where it was not fitted."""
+"""Share of a torque that the state may predict in cross-validation for the torque to be random (choice)."""
 
-LIKE_CHANCE = 0.4, 5.0
-"""And while what free curves leave of it, over what they would leave of such a torque (of a short recording they follow
-most of what chance does, too), lies between these. Of 43 true gusts 42 had 0.65 to 3.3; what a misled model of a rig
-leaves has 7 and more."""
+LIKE_RANDOM = 0.4, 5.0
+"""Range of what free curves leave of the rest, over what they would leave of a random torque of the same tau.
+
+Measured: of 43 true gusts 42 had 0.65 to 3.3; what a wrong model of a rig leaves has 7 and more. In a short recording
+curves follow most of a random torque too, hence the ratio."""
 
 JUMPS = 5.0
-"""Innovations of the torque's filter that are heavier than this are of an angle that jumps. A random torque has 1; a
-coupling that slips by 0.08 rad every two seconds 20 and more."""
+"""Kurtosis of the innovations, over that of a normal distribution, above which the angle jumps.
+
+Measured: a random torque has 1; a coupling that slips by 0.08 rad every two seconds has 20 and more."""
 
 DRAWS = 20
-"""Random torques from which that share is known."""
+"""Random torques from which the share that free curves leave of them is computed (choice)."""
 
 
-def found(chains: Chains, arm: Findings) -> Weighed | None:
-    """`gust`, if that is what the arm leaves; of an unknown rig, `arm` loses what is not needed beside it."""
-    torque = _weighed(chains, arm.final)
-    if torque is not None and arm.found and chains.fit_nominal:
-        _drop_what_chance_explains(chains, arm)
-        torque = _weighed(chains, arm.final)
-    return torque
+@dataclass(frozen=True)
+class GustDetection:
+    """The effect `gust`, if it was detected, and what remains found of the arm beside it."""
+
+    gust: RankedHypothesis | None
+    arm: Findings
 
 
-def tracked(chains: Chains, arm: Fit, follow: Fit | None = None) -> Gust:
-    """The random torque that would do what a fit of the arm leaves; `follow`: what another one leaves."""
+def detect(chains: CutChains, arm: Findings) -> GustDetection:
+    """Test the rest of the arm for a random torque.
+
+    Args:
+        chains: cut; their arms have their inputs.
+        arm: what was found in the arm.
+
+    Returns:
+        The effect; for an uncalibrated rig, the findings without the effects that a random torque explains.
+    """
+    gust = _judged(chains, arm.final)
+    if gust is not None and arm.found and not chains.policy.calibrated:
+        arm = _without_random(chains, arm)
+        gust = _judged(chains, arm.final)
+    return GustDetection(gust, arm)
+
+
+def track(chains: CutChains, arm: Fit, follow: Fit | None = None) -> Gust:
+    """The random torque that would cause the residual of the angle in the first recording.
+
+    Args:
+        chains: cut.
+        arm: a fit of the arm, whose parameters the filter takes.
+        follow: the fit whose residual is tracked; by default the same.
+    """
     chain = chains.each[0]
     s = chain.signals
-    n = with_values(chains.model, chains.own(arm.values, 0)).numbers()
-    left = (s.theta - chain.arm(chains.own((follow or arm).values, 0)))[: s.train]
+    n = with_values(chains.model, chains.values_of(arm.values, 0)).numbers()
+    left = (s.theta - chain.arm(chains.values_of((follow or arm).values, 0)))[: s.train]
     return fit_gust(left, s.theta[: s.train], n["mgd_over_J"], n["c_over_J"], s.sigma["theta"], s.period)
 
 
-def angle(chains: Chains, s: Signals) -> Array:
-    """The angle (N,) without gaps: of an unknown rig, which may be read seldom, with lines across them."""
-    if not chains.fit_nominal:
+def filled_angle(chains: CutChains, s: Signals) -> Array:
+    """[rad] The angle (N,) without gaps; interpolated for an uncalibrated rig, which may be sampled at a low rate."""
+    if chains.policy.calibrated:
         return np.nan_to_num(s.theta)
     known = np.flatnonzero(np.isfinite(s.theta))
     return np.interp(np.arange(len(s)), known, s.theta[known])
 
 
-def calm(x: Array) -> Array:
-    """A moving mean (N,) long enough to take a derivative of quantised angles."""
+def smoothed_angle(x: Array) -> Array:
+    """An angle (N,) smoothed by a Hann window of 25 samples, for the derivative of quantised readings."""
     kernel = np.hanning(27)[1:-1]
     return np.convolve(np.pad(x, 12, mode="edge"), kernel / kernel.sum(), mode="valid")
 
 
-def _weighed(chains: Chains, final: Fit) -> Weighed | None:
-    """`gust`, if what a fit of the arm leaves is a random torque: no state predicts it, and no free curve takes it."""
+def _judged(chains: CutChains, final: Fit) -> RankedHypothesis | None:
+    """`gust` if the rest of a fit of the arm is a random torque: no state predicts it, and no free curve fits it."""
     if final.scale.get("theta", 1.0) <= GOOD_ENOUGH:
         return None
     chain = chains.each[0]
     s = chain.signals
-    g = tracked(chains, final)
-    theta, speed = angle(chains, s)[g.index], chain.speed[g.index]
-    rate = np.gradient(calm(theta), g.index * s.period)
+    g = track(chains, final)
+    theta, speed = filled_angle(chains, s)[g.index], chain.speed[g.index]
+    rate = np.gradient(smoothed_angle(theta), g.index * s.period)
     slope = np.gradient(speed, g.index * s.period)
-    columns = np.hstack([*(hats(x)[0] for x in (theta, rate, speed, slope)), (speed * rate)[:, None]])
-    known = [Unknown(u.name, u.mean, u.sd, u.low, u.high, None, u.log) for u in nominal_unknowns(chains, "arm")
-             if u.name in final.values]
-    if g.gain <= 0.0 or g.heavy > JUMPS or follows_state(g.torque, columns) >= RANDOM:
+    columns = np.hstack([*(hats(x, knots_of(x)) for x in (theta, rate, speed, slope)), (speed * rate)[:, None]])
+    known = [p for p in nominal_parameters(chains, "arm") if p.name in final.values]
+    if g.gain <= 0.0 or g.kurtosis > JUMPS or follows_state(g.torque, columns) >= RANDOM:
         return None
     rng = np.random.default_rng(0)
-    curves = shapes(chains, "arm", final, known, torques=lambda n: gauss_markov((DRAWS, n), g.tau, s.period, rng))[0]
-    low, high = (x * curves.left_of_chance * (curves.before - 1.0) for x in LIKE_CHANCE)
-    if not low < curves.left - 1.0 < high:
+    term = missing_terms(chains, "arm", final, known,
+                         torques=lambda n: gauss_markov((DRAWS, n), g.tau, s.period, rng))[0]
+    low, high = (x * term.left_of_random * (term.before - 1.0) for x in LIKE_RANDOM)
+    if not low < term.left - 1.0 < high:
         return None
     values = {"gust.sigma": g.sigma, "gust.tau": g.tau}
     sd = {"gust.sigma": g.sigma * g.sigma_sd, "gust.tau": g.tau * g.tau_sd}
-    return Weighed(Hypothesis("gust"), Fit(values, sd, {}, {}, {}, 0.0, {}), g.gain, 1.0)
+    return RankedHypothesis(Hypothesis("gust"), estimate(values, sd), g.gain, 1.0)
 
 
-def _drop_what_chance_explains(chains: Chains, arm: Findings) -> None:
-    """Take out what is not needed beside a random torque: chance looks like many an effect."""
-    def without(h: Hypothesis) -> Fit:
-        return refit(chains, "arm", [e for e in arm.effects if e is not h], arm.final.values)
+def _without_random(chains: CutChains, arm: Findings) -> Findings:
+    """The findings without effects that are not needed beside a random torque, which resembles many an effect."""
+    def without(now: Findings, h: Hypothesis) -> Fit:
+        return refit(chains, "arm", [e for e in now.effects if e is not h], now.final.values)
 
-    def lost(f: Fit) -> float:
-        counts = counts_of([arm.final, f])
-        simpler = f.simplicity(counts) - arm.final.simplicity(counts)
-        return tracked(chains, arm.final).likelihood - tracked(chains, f).likelihood - simpler
+    def lost(now: Findings, f: Fit) -> float:
+        ess = largest_ess([now.final, f])
+        simpler = f.log_occam(ess) - now.final.log_occam(ess)
+        return track(chains, now.final).log_likelihood - track(chains, f).log_likelihood - simpler
 
-    drop_unneeded(arm, without, lost)
+    return drop_unneeded(arm, without, lost)

@@ -1,120 +1,166 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The hypotheses: each effect of the catalogue, or one number that is off; where searches begin, what each changes."""
+"""The hypotheses: each effect of the catalogue, and each parameter of the model that may be far off."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aeropend_ident.diagnosis.chain.chain import BLOCKS, PLACE_OF_NUMBER, Chains
-from aeropend_ident.diagnosis.chain.priors import initial_unknowns
-from aeropend_ident.estimation.map_fit import Unknown
+from aeropend_ident.diagnosis.chain.chain import DELAY, CutChains
+from aeropend_ident.diagnosis.chain.priors import initial_states
+from aeropend_ident.diagnosis.chain.values import PLACE_OF_PARAMETER, STAGES
+from aeropend_ident.estimation.parameter import Parameter
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
 from aeropend_sim.model.parameters import PARAMETERS, Model
 
 MISMATCH_SD = 0.3
-"""As `NUMBER_SD`, for the number that `parameter_mismatch` blames."""
+"""Relative standard deviation of a parameter that `parameter_mismatch` blames: ten times that of a calibrated one."""
 
 EFFECT_ODDS = 1.0 / 50.0
-"""Prior odds of one given effect against none further; `parameter_mismatch` shares them among its numbers."""
+"""Prior odds of one given effect against no further effect: about even for the catalogue as a whole (choice).
+
+`parameter_mismatch` shares them among its parameters."""
+
+SIZE_SD = 3.0
+"""Standard deviation of an effect's size, in default sizes: rigs may show several times the default (choice)."""
+
+FIRST_SIZE = 0.3
+"""Size, in default sizes, from which a search starts (choice)."""
+
+SAME = 1e-6
+"""Change of a residual, in units of a reading's noise, that is rounding."""
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One effect of the catalogue, or one number that is off.
+    """One effect of the catalogue, or one parameter of the model that is far off.
 
     Attributes:
-        effect: id. number: the number blamed, for `parameter_mismatch`.
-        starts: where searches begin, each the effect's own unknowns.
+        effect: id of the effect.
+        parameter: of the model, for `parameter_mismatch`; else "".
+        starts: start points of searches, each the effect's own parameters, its size first.
     """
 
     effect: str
-    number: str = ""
-    starts: tuple[tuple[Unknown, ...], ...] = ()
+    parameter: str = ""
+    starts: tuple[tuple[Parameter, ...], ...] = ()
 
     @property
     def name(self) -> str:
-        """A name that no other hypothesis has."""
-        return f"{self.effect}:{self.number}" if self.number else self.effect
+        """A unique name."""
+        return f"{self.effect}:{self.parameter}" if self.parameter else self.effect
 
     @property
     def place(self) -> str:
-        """Where in the chain it lives."""
-        return PLACE_OF_NUMBER[self.number] if self.number else CATALOGUE[self.effect].place
+        """Its place in the chain."""
+        return PLACE_OF_PARAMETER[self.parameter] if self.parameter else CATALOGUE[self.effect].place
+
+    @property
+    def own(self) -> tuple[Parameter, ...]:
+        """Its own parameters, its size first."""
+        return self.starts[0]
+
+    @property
+    def log_odds(self) -> float:
+        """Prior log odds against no further effect."""
+        return math.log(EFFECT_ODDS / (sum(map(len, STAGES.values())) if self.parameter else 1))
 
 
-def hypotheses(model: Model, *, numbers: bool = True) -> list[Hypothesis]:
-    """Every effect of the catalogue that the model lacks, and every of its `numbers` as a mismatch."""
+def hypotheses(model: Model, *, mismatches: bool = True) -> list[Hypothesis]:
+    """Every effect of the catalogue that the model lacks.
+
+    Args:
+        model: the nominal model.
+        mismatches: whether each parameter of the model may be far off, too.
+    """
     all_ = [Hypothesis(id_, starts=tuple(_starts(id_))) for id_ in CATALOGUE if id_ not in model.effects]
-    if not numbers:
+    if not mismatches:
         return all_
-    for block in BLOCKS.values():
-        for name in block:
+    for names in STAGES.values():
+        for name in names:
             nominal = model.model[name]
             if nominal != 0.0:
                 p = PARAMETERS[f"model.{name}"]
-                unknown = Unknown(name, nominal, MISMATCH_SD * abs(nominal), p.low, p.high, start=1.1 * nominal)
-                all_.append(Hypothesis(PARAMETER_MISMATCH, name, ((unknown,),)))
+                own = Parameter(name, nominal, MISMATCH_SD * abs(nominal), p.low, p.high, start=1.1 * nominal)
+                all_.append(Hypothesis(PARAMETER_MISMATCH, name, ((own,),)))
     return all_
 
 
-def _starts(id_: str) -> Iterable[tuple[Unknown, ...]]:
-    """Searches for an effect: its size from a third of the default, each other parameter from several places."""
+def _starts(id_: str) -> Iterable[tuple[Parameter, ...]]:
+    """Start points for an effect: a third of its default size, each other parameter at several places of its range."""
     effect = CATALOGUE[id_]
     size = effect.parameters[effect.size]
     step = size.default - size.neutral
-    head = Unknown(f"{id_}.{effect.size}", size.neutral, 3.0 * abs(step), size.low, size.high,
-                   start=size.neutral + 0.3 * step)
+    head = Parameter(f"{id_}.{effect.size}", size.neutral, SIZE_SD * abs(step), size.low, size.high,
+                     start=size.neutral + FIRST_SIZE * step)
     others = [(name, p) for name, p in effect.parameters.items() if name != effect.size]
     if not others:
         return [(head,)]
-    grids: list[list[Unknown]] = []
+    grids: list[list[Parameter]] = []
     for name, p in others:
         full = f"{id_}.{name}"
         if p.low > 0.0:
             spread = 0.5 * math.log(p.high / p.low)
             places = [p.default * math.exp(f * spread) for f in (-0.7, -0.35, 0.0, 0.35, 0.7)]
-            grids.append([Unknown(full, p.default, 0.6 * spread, p.low, p.high, min(max(x, p.low), p.high), log=True)
+            grids.append([Parameter(full, p.default, 0.6 * spread, p.low, p.high, min(max(x, p.low), p.high), log=True)
                           for x in places])
         else:
             middle, half = 0.5 * (p.low + p.high), 0.5 * (p.high - p.low)
-            grids.append([Unknown(full, middle, half, p.low, p.high, middle + f * half) for f in (-0.6, 0.05, 0.65)])
-    # the second parameter is searched, any third starts in its middle
+            grids.append([Parameter(full, middle, half, p.low, p.high, middle + f * half) for f in (-0.6, 0.05, 0.65)])
+    # the second parameter is searched; a third starts in its middle
     return [(head, first, *(g[len(g) // 2] for g in grids[1:])) for first in grids[0]]
 
 
-def blocks_of(chains: Chains, hypothesis: Hypothesis) -> tuple[str, ...]:
-    """The parts of the cut chain whose readings a hypothesis changes, found by trying it."""
+def stages_of(chains: CutChains, hypothesis: Hypothesis) -> tuple[str, ...]:
+    """The stages whose residuals a hypothesis changes, found by trying it."""
     values: dict[str, float]
-    if hypothesis.number:
-        values = {hypothesis.number: 1.2 * chains.model.model[hypothesis.number]}
+    if hypothesis.parameter:
+        values = {hypothesis.parameter: 1.2 * chains.model.model[hypothesis.parameter]}
     else:
         values = {f"{hypothesis.effect}.{k}": p.default for k, p in CATALOGUE[hypothesis.effect].parameters.items()}
+    guess = not chains.policy.calibrated
     changed = []
-    for block in BLOCKS:
-        # an arm that nothing drives must at least be let go
-        state = {u.name: u.mean for u in initial_unknowns(chains, block)} if chains.fit_nominal else {}
-        before, after = chains.residuals(block)(state), chains.residuals(block)({**state, **values})
+    for stage in STAGES:
+        # an effect of the arm shows only if the arm moves: without a drive it needs its initial state
+        state = {p.name: p.mean for p in initial_states(chains, stage)} if guess else {}
+        before, after = chains.residuals(stage)(state), chains.residuals(stage)({**state, **values})
         if any(len(r) and not np.array_equal(r, after[k]) and not (
-                chains.fit_nominal and np.allclose(r, after[k], rtol=0.0, atol=1e-6)) for k, r in before.items()):
-            changed.append(block)
+                guess and np.allclose(r, after[k], rtol=0.0, atol=SAME)) for k, r in before.items()):
+            changed.append(stage)
     return tuple(changed)
 
 
-def linear_unknowns(id_: str) -> list[Unknown]:
-    """Two unknowns in which an effect is linear, in place of its size and second parameter; both 0 without it."""
+def delay_from_voltage(chains: CutChains, hypothesis: Hypothesis, values: Mapping[str, float]) -> Hypothesis:
+    """The command delay with its start where the voltage places it: no gradient leads there, as readings jump with it.
+
+    Args:
+        chains: cut.
+        hypothesis: any; others than `command_delay` are returned as they are.
+        values: of the actuator without a delay.
+    """
+    if hypothesis.effect != "command_delay" or not chains.each[0].signals.has("v_a"):
+        return hypothesis
+    start = chains.each[0].likeliest_delay(chains.values_of(values, 0))
+    own = hypothesis.own[0]
+    assert own.name == DELAY
+    return replace(hypothesis, starts=((replace(own, mean=start, start=start),),))
+
+
+def linear_parameters(id_: str) -> list[Parameter]:
+    """Two parameters in which an effect is linear, in place of its size and second parameter; both 0 without it."""
     size, second = list(CATALOGUE[id_].parameters.values())[:2]
     if CATALOGUE[id_].linear_in == "polar":
-        return [Unknown(f"{id_}.cosine", 0.0, 3.0 * size.default), Unknown(f"{id_}.sine", 0.0, 3.0 * size.default)]
-    return [Unknown(f"{id_}.slope", 0.0, 3.0 * size.default, size.low, size.high),
-            Unknown(f"{id_}.product", 0.0, 3.0 * size.default * second.default)]
+        return [Parameter(f"{id_}.cosine", 0.0, SIZE_SD * size.default),
+                Parameter(f"{id_}.sine", 0.0, SIZE_SD * size.default)]
+    return [Parameter(f"{id_}.slope", 0.0, SIZE_SD * size.default, size.low, size.high),
+            Parameter(f"{id_}.product", 0.0, SIZE_SD * size.default * second.default)]
 
 
 def from_linear(id_: str, values: Mapping[str, float]) -> dict[str, float]:
-    """Values with the unknowns of `linear_unknowns` turned into the effect's own parameters."""
+    """Values with those of `linear_parameters` turned into the effect's own parameters."""
     (size_name, size), (second_name, _) = list(CATALOGUE[id_].parameters.items())[:2]
     own = dict(values)
     if CATALOGUE[id_].linear_in == "polar":
@@ -122,12 +168,7 @@ def from_linear(id_: str, values: Mapping[str, float]) -> dict[str, float]:
         pair = math.hypot(x, y), math.atan2(y, x)
     else:
         x, y = own.pop(f"{id_}.slope"), own.pop(f"{id_}.product")
-        x = max(x, 1e-6 * size.default)  # so that the product alone can act
+        x = max(x, 1e-6 * size.default)  # the product alone must be able to act
         pair = x, y / x
     own[f"{id_}.{size_name}"], own[f"{id_}.{second_name}"] = pair
     return own
-
-
-def log_odds(hypothesis: Hypothesis) -> float:
-    """Prior log odds of a hypothesis against none further."""
-    return math.log(EFFECT_ODDS / (sum(map(len, BLOCKS.values())) if hypothesis.number else 1))

@@ -1,168 +1,146 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which effects: part by part, round by round, until what is left passes as noise or nothing explains it."""
+"""The search for missing effects: stage by stage, round by round, until the rest is noise or nothing explains it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import expit
 
-from aeropend_ident.diagnosis.chain.cached_chain import ThriftyChains
-from aeropend_ident.diagnosis.chain.chain import BLOCKS, Chains
-from aeropend_ident.diagnosis.chain.priors import NUMBER_SD, free_swinging, nominal_unknowns
-from aeropend_ident.diagnosis.search.free_curves import shapes
-from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, blocks_of, hypotheses, log_odds
-from aeropend_ident.diagnosis.search.selection import (
-    CONTENDERS,
-    FIRST_LOOK,
-    ROUNDS,
-    Round,
-    Weighed,
-    adopted,
-    against,
-    counts_of,
-    started,
-)
-from aeropend_ident.estimation.map_fit import Fit, Unknown, fit
-
-MATERIAL = 0.3
-"""What an effect must explain in one channel at least, RMS in units of a reading's noise, to be worth a word."""
-
-UNSURE = 0.75
-"""As `MATERIAL`, of a rig whose noise is only what the recording shows: it may be a seventh larger."""
+from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD, nominal_parameters
+from aeropend_ident.diagnosis.chain.values import STAGES
+from aeropend_ident.diagnosis.policy import MATERIAL
+from aeropend_ident.diagnosis.search.findings import Findings, adopted, drop_unneeded
+from aeropend_ident.diagnosis.search.free_curves import missing_terms
+from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, delay_from_voltage, hypotheses, stages_of
+from aeropend_ident.diagnosis.search.selection import CONTENDERS, ROUNDS, SelectionRound, log_evidence_over
+from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess
+from aeropend_ident.estimation.parameter import Parameter, started
 
 FOLLOWS = 0.01
-"""Share of a mean square that free curves over inputs and states must explain, beyond chance, to be no noise."""
+"""Share of a mean square that free curves must explain, beyond chance, for a residual to follow inputs and states.
 
-STRAYED = 3.0
-"""Standard deviations by which a number must leave its prior to count as strayed."""
+Choice: so little does not change a verdict, and is far above chance with some thousand samples."""
 
-MOST_RUNS = 3500
-"""Simulations of an unknown rig after which no further effect is looked for, and no fit is taken to the end."""
+OUTSIDE = 3.0
+"""Standard deviations of its prior by which a parameter must be off to count as outside the prior: 99.7 %."""
 
 MOST_EFFECTS = 3
-"""How many effects are looked for in one part of the chain."""
+"""Effects that are searched in one stage (choice)."""
+
+CUT_SHORT_ROUNDS = 2
+"""Rounds of the last fits when the budget is spent (choice)."""
+
+BETTER_ALONE = 1.0
+"""Log evidence by which the fit without an effect must improve from a rival's parameters to replace the old one."""
+
+EVEN = 0.5
+"""Probability of all hypotheses of a round together above which an effect is found: more likely than not."""
 
 
-@dataclass
-class Findings:
-    """What was found in one part of the chain.
-
-    Attributes:
-        block: name of the part.
-        base: the fit with the nominal structure. final: the fit with all that was found.
-        found: the effects, in the order found, each with its rivals of that round (itself first).
-        cut_short: the search was ended by what it may cost, not by what it found.
-    """
-
-    block: str
-    base: Fit
-    final: Fit
-    found: list[list[Weighed]] = field(default_factory=list)
-    rivals: list[Weighed] = field(default_factory=list)
-    cut_short: bool = False
-
-    @property
-    def effects(self) -> list[Hypothesis]:
-        """The hypotheses found."""
-        return [round_[0].hypothesis for round_ in self.found]
-
-
-def search(chains: Chains, jobs: int = 1, progress: Callable[[str, float], None] = lambda *_: None
+def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], None] = lambda *_: None
            ) -> dict[str, Findings]:
-    """Look for effects part by part, in the direction of the chain; each part is fed as the one before was explained.
+    """Search for effects stage by stage, along the chain.
 
     Args:
-        chains: the cut chains; their inner signals are renewed.
-        jobs: threads. progress: told the part and the share of parts behind.
+        chains: cut; the input of each stage is set to what was measured, described by what was found before it.
+        jobs: threads.
+        progress: called with the stage and the share of stages behind it.
 
     Returns:
-        Block -> what was found.
+        Stage -> what was found.
     """
     findings: dict[str, Findings] = {}
-    everything = hypotheses(chains.model, numbers=not chains.fit_nominal)
-    where = {h.name: blocks_of(chains, h) for h in everything}
-    carried: dict[str, Unknown] = {}
+    everything = hypotheses(chains.model, mismatches=chains.policy.calibrated)
+    acts_on = {h.name: stages_of(chains, h) for h in everything}
+    carried: dict[str, Parameter] = {}
     with ThreadPoolExecutor(jobs) as pool:
-        for done, block in enumerate(BLOCKS):
-            progress(block, done / len(BLOCKS))
-            mine = [h for h in everything if where[h.name][:1] == (block,)]
-            f = _search_block(chains, block, mine, where, list(carried.values()), pool)
-            findings[block] = f
-            # what was found here and shows further down goes along, as sure as it is
+        for done, stage in enumerate(STAGES):
+            progress(stage, done / len(STAGES))
+            mine = [h for h in everything if acts_on[h.name][:1] == (stage,)]
+            f = _search_stage(chains, stage, mine, acts_on, list(carried.values()), pool)
+            findings[stage] = f
+            # an effect that acts on later stages too goes along, with the uncertainty that it has here
             for h in f.effects:
-                if len(where[h.name]) > 1:
-                    for u in h.starts[0]:
-                        carried[u.name] = Unknown(u.name, f.final.values[u.name], max(f.final.sd[u.name], 1e-12),
-                                                  u.low, u.high)
-            chains.feed_next(block, f.final.values)
+                if len(acts_on[h.name]) > 1:
+                    for p in h.own:
+                        carried[p.name] = Parameter(p.name, f.final.values[p.name], max(f.final.sd[p.name], 1e-12),
+                                                    p.low, p.high)
+            chains.set_next_input(stage, f.final.values)
     return findings
 
 
-def _search_block(chains: Chains, block: str, candidates: list[Hypothesis], where: Mapping[str, tuple[str, ...]],
-                  carried: list[Unknown], pool: ThreadPoolExecutor) -> Findings:
-    known: list[Unknown] = [*nominal_unknowns(chains, block), *carried]
-    base = fit(chains.residuals(block), known)
-    findings = Findings(block, base, base)
+def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
+                  acts_on: Mapping[str, tuple[str, ...]], carried: list[Parameter], pool: ThreadPoolExecutor
+                  ) -> Findings:
+    nominal: list[Parameter] = [*nominal_parameters(chains, stage), *carried]
+    base = fit(chains.residuals(stage), nominal)
+    findings = Findings(stage, base, base)
     if not base.residuals:
         return findings
-    candidates = [_started_late(chains, h, base.values) if h.effect == "command_delay" else h for h in candidates]
-    downstream = {}
-    for other in {b for h in candidates for b in where[h.name] if b != block}:
-        downstream[other] = fit(chains.residuals(other), nominal_unknowns(chains, other))
-    nominal = known
-    # what brakes a free swing is told by the evidence alone: its noise is known but roughly, and its readings are few
-    swinging = chains.fit_nominal and free_swinging(chains.recordings)
-    thrifty = chains if isinstance(chains, ThriftyChains) and not swinging else None
+    candidates = [delay_from_voltage(chains, h, base.values) for h in candidates]
+    others = {b for h in candidates for b in acts_on[h.name] if b != stage}
+    downstream = {b: fit(chains.residuals(b), nominal_parameters(chains, b)) for b in others}
+    known = nominal
     while len(findings.found) < MOST_EFFECTS:
-        here = Round(chains, block, where, downstream, known, findings.final, pool)
-        if not swinging and _explained(here):
+        here = SelectionRound(chains, stage, acts_on, downstream, known, findings.final, pool)
+        if chains.policy.driven and _explained(here):
             break
-        if thrifty is not None and thrifty.runs > MOST_RUNS:
-            findings.cut_short = True
+        if here.budget_spent:
+            findings = replace(findings, cut_short=True)
             break
-        open_ = [h for h in candidates if h.name not in {g.name for g in findings.effects}]
-        tried, lead = here.first_look(open_), None
-        if not tried:
+        findings, best = _select(here, findings, candidates)
+        if best is None:
             break
-        if thrifty is not None:
-            tried, lead = here.led(tried)
-            findings.cut_short |= thrifty.runs > MOST_RUNS
-        tried = here.to_the_end(tried, FIRST_LOOK if findings.cut_short else ROUNDS, but=lead)
-        if not here.guessed and not any(_passes_as_noise(f, MATERIAL) for _, f in tried):
-            tried = here.from_elsewhere(tried)
-        if not findings.found:
-            tried = here.identified_anew(open_, tried)
-        rivals = here.weighed(tried)
-        # the numbers that a rival was led to may serve as well without it
-        again = fit(chains.residuals(block), started(known, rivals[0].fit.values))
-        counts = counts_of([here.current, again])
-        if again.evidence(counts) > here.current.evidence(counts) + 1.0:
-            here, findings.final = replace(here, current=again), again
-            findings.base = findings.base if findings.found else again
-            rivals = here.weighed(tried)
-        best = rivals[0]
-        matters = best.hypothesis.number or _material(here.current, best.fit) or strayed(chains, block, here.current)
-        if swinging and findings.found:  # what leaves a narrow band seems to leave many independent samples
-            sure = [float(expit(against(here.current, w.fit) + log_odds(w.hypothesis))) for w in rivals]
-            rivals = [replace(w, probability=min(w.probability, p)) for w, p in zip(rivals, sure, strict=True)]
-        if sum(w.probability for w in rivals) < 0.5 or not matters:
-            findings.rivals = rivals
-            break
-        findings.found.append(rivals)
-        known = adopted(known, best.hypothesis)
-        findings.final = best.fit if set(best.fit.residuals) == set(base.residuals) else fit(
-            chains.residuals(block), started(known, best.fit.values))
-    _swap(chains, findings, nominal)
-    _prune(chains, findings, nominal)
-    return findings
+        known = adopted(known, best)
+    return _without_unneeded(chains, _with_better_rivals(chains, findings, nominal), nominal)
 
 
-def _beside(findings: Findings, nominal: list[Unknown], hypothesis: Hypothesis) -> list[Unknown]:
-    """The unknowns of all that was found but one."""
+def _select(here: SelectionRound, findings: Findings, candidates: list[Hypothesis]
+            ) -> tuple[Findings, Hypothesis | None]:
+    """One selection round: screen, fit, rank, accept; returns the effect that was accepted, if any."""
+    chains, policy = here.chains, here.chains.policy
+    open_ = [h for h in candidates if h.name not in {g.name for g in findings.effects}]
+    tried, lead = here.screened(open_), None
+    if not tried:
+        return findings, None
+    if policy.budget is not None:
+        tried, lead = here.warm_started(tried)
+        findings = replace(findings, cut_short=findings.cut_short or here.budget_spent)
+    rounds = CUT_SHORT_ROUNDS if findings.cut_short else ROUNDS
+    tried = here.converged(tried, rounds, but=lead)
+    if not policy.wide_search and not any(passes_as_noise(f, MATERIAL) for _, f in tried):
+        tried = here.multi_started(tried)
+    if not findings.found:
+        tried = here.refitted_with_nominal(open_, tried)
+    ranked = here.ranked(tried)
+    # the parameters that the best hypothesis was led to may serve as well without it
+    again = fit(chains.residuals(here.stage), started(here.known, ranked[0].fit.values))
+    ess = largest_ess([here.current, again])
+    if again.log_evidence(ess) > here.current.log_evidence(ess) + BETTER_ALONE:
+        here = replace(here, current=again)
+        findings = replace(findings, final=again, base=findings.base if findings.found else again)
+        ranked = here.ranked(tried)
+    best = ranked[0]
+    matters = (best.hypothesis.parameter or _material(here.current, best.fit)
+               or outside_prior(chains, here.stage, here.current))
+    if not policy.driven and findings.found:  # a residual in a narrow band seems to hold many independent samples
+        sure = [float(expit(log_evidence_over(here.current, r.fit) + r.hypothesis.log_odds)) for r in ranked]
+        ranked = tuple(replace(r, probability=min(r.probability, p)) for r, p in zip(ranked, sure, strict=True))
+    if sum(r.probability for r in ranked) < EVEN or not matters:
+        return replace(findings, rivals=ranked), None
+    # an effect that acts on later stages was fitted to them too: the final fit is of this stage alone
+    final = best.fit if set(best.fit.residuals) == set(findings.base.residuals) else fit(
+        chains.residuals(here.stage), started(adopted(here.known, best.hypothesis), best.fit.values))
+    return replace(findings, found=(*findings.found, ranked), final=final), best.hypothesis
+
+
+def _beside(findings: Findings, nominal: list[Parameter], hypothesis: Hypothesis) -> list[Parameter]:
+    """The parameters of all effects found but one."""
     known = nominal
     for h in findings.effects:
         if h is not hypothesis:
@@ -170,116 +148,105 @@ def _beside(findings: Findings, nominal: list[Unknown], hypothesis: Hypothesis) 
     return known
 
 
-def _swap(chains: Chains, findings: Findings, nominal: list[Unknown]) -> None:
-    """Replace what was found first, and only stood in for what was not yet known of the others, by a close rival."""
+def _with_better_rivals(chains: CutChains, findings: Findings, nominal: list[Parameter]) -> Findings:
+    """Replace an effect found early by a close rival that fits better beside the effects found later."""
     if len(findings.found) < 2:
-        return
-    for k, round_ in enumerate(findings.found):
-        known = _beside(findings, nominal, round_[0].hypothesis)
+        return findings
+    for k in range(len(findings.found)):
+        selection = findings.found[k]
+        known = _beside(findings, nominal, selection[0].hypothesis)
         taken = {h.name for h in findings.effects}
-        for rival in round_[1:CONTENDERS]:
+        for rival in selection[1:CONTENDERS]:
             if rival.gain <= 0.0 or rival.hypothesis.name in taken:
                 continue
-            begun = {**findings.final.values, **{u.name: rival.fit.values[u.name] for u in rival.hypothesis.starts[0]}}
-            f = fit(chains.residuals(findings.block), started(adopted(known, rival.hypothesis), begun))
-            counts = counts_of([findings.final, f])
-            odds = log_odds(rival.hypothesis) - log_odds(findings.found[k][0].hypothesis)
-            gain = f.evidence(counts) - findings.final.evidence(counts) + odds
+            begun = {**findings.final.values, **{p.name: rival.fit.values[p.name] for p in rival.hypothesis.own}}
+            f = fit(chains.residuals(findings.stage), started(adopted(known, rival.hypothesis), begun))
+            ess = largest_ess([findings.final, f])
+            odds = rival.hypothesis.log_odds - selection[0].hypothesis.log_odds
+            gain = f.log_evidence(ess) - findings.final.log_evidence(ess) + odds
             if gain > 0.0:
                 sure = float(expit(gain))
-                others = [replace(w, probability=1.0 - sure if w is round_[0] else 0.0) for w in round_
-                          if w is not rival]
-                findings.found[k] = [replace(rival, fit=f, gain=rival.gain + gain, probability=sure), *others]
-                findings.final = f
+                others = [replace(r, probability=1.0 - sure if r is selection[0] else 0.0) for r in selection
+                          if r is not rival]
+                swapped = (replace(rival, fit=f, gain=rival.gain + gain, probability=sure), *others)
+                found = (*findings.found[:k], swapped, *findings.found[k + 1:])
+                findings = replace(findings, found=found, final=f)
                 break
+    return findings
 
 
-def _started_late(chains: Chains, hypothesis: Hypothesis, values: Mapping[str, float]) -> Hypothesis:
-    """The delay where the voltage places it: a reading changes with the delay in jumps, which no slope leads over."""
-    own = hypothesis.starts[0][0]
-    if not chains.each[0].signals.has("v_a"):
-        return hypothesis
-    start = chains.each[0].likeliest_delay(chains.own(values, 0))
-    return replace(hypothesis, starts=((replace(own, mean=start, start=start),),))
+def _without_unneeded(chains: CutChains, findings: Findings, nominal: list[Parameter]) -> Findings:
+    """Take out effects found early that are not needed beside those found later."""
+    def without(now: Findings, h: Hypothesis) -> Fit:
+        return fit(chains.residuals(now.stage), started(_beside(now, nominal, h), now.final.values))
+
+    def lost(now: Findings, f: Fit) -> float:
+        ess = largest_ess([now.final, f])
+        return now.final.log_evidence(ess) - f.log_evidence(ess)
+
+    return drop_unneeded(findings, without, lost, least=1)
 
 
-def _prune(chains: Chains, findings: Findings, nominal: list[Unknown]) -> None:
-    """Take out again what was found first and is not needed beside what was found later."""
-    def without(h: Hypothesis) -> Fit:
-        known = _beside(findings, nominal, h)
-        return fit(chains.residuals(findings.block), started(known, findings.final.values))
-
-    def lost(f: Fit) -> float:
-        counts = counts_of([findings.final, f])
-        return findings.final.evidence(counts) - f.evidence(counts)
-
-    drop_unneeded(findings, without, lost, least=1)
-
-
-def drop_unneeded(findings: Findings, without: Callable[[Hypothesis], Fit], lost: Callable[[Fit], float], least: int = 0
-                  ) -> None:
-    """Take out what was found and is not needed, the least needed first.
+def refit(chains: CutChains, stage: str, effects: Sequence[Hypothesis], start: Mapping[str, float]) -> Fit:
+    """Fit a stage again with given effects.
 
     Args:
-        findings: changed in place. without: fits what was found without one. lost: log evidence that such a fit has
-            less than `findings.final`. least: how many are kept in any case.
+        chains: cut.
+        stage: to be fitted.
+        effects: of the stage.
+        start: values to start from.
     """
-    while len(findings.found) > least:
-        tried = [(round_, without(round_[0].hypothesis)) for round_ in findings.found]
-        needed = [lost(f) + log_odds(round_[0].hypothesis) for round_, f in tried]
-        k = needed.index(min(needed))
-        if needed[k] > 0.0:
-            break
-        round_, findings.final = tried[k]
-        findings.found.remove(round_)
+    parameters = [*nominal_parameters(chains, stage), *(p for h in effects for p in h.own)]
+    return fit(chains.residuals(stage), started(parameters, start))
 
 
-def refit(chains: Chains, block: str, effects: Sequence[Hypothesis], start: Mapping[str, float]) -> Fit:
-    """A part of the chain with these effects, fitted anew from where its values were."""
-    unknowns = [*nominal_unknowns(chains, block), *(u for h in effects for u in h.starts[0])]
-    return fit(chains.residuals(block), started(unknowns, start))
-
-
-def strayed(chains: Chains, block: str, f: Fit) -> bool:
-    """Whether a number of the block had to go where its prior does not let it, to cover for something."""
+def outside_prior(chains: CutChains, stage: str, f: Fit) -> bool:
+    """Whether a calibrated parameter of the stage left its prior to stand in for a missing effect."""
     nominal = chains.model.model
-    return not chains.fit_nominal and any(
-        abs(f.values[n] - nominal[n]) > STRAYED * NUMBER_SD * abs(nominal[n]) for n in BLOCKS[block] if n in f.values)
+    return chains.policy.calibrated and any(
+        abs(f.values[n] - nominal[n]) > OUTSIDE * NOMINAL_SD * abs(nominal[n]) for n in STAGES[stage] if n in f.values)
 
 
-def not_strayed(chains: Chains, block: str, f: Fit, known: Iterable[Unknown]) -> Fit:
-    """A fit of the nominal structure, or, where numbers strayed, one that keeps them within their uncertainty."""
-    if not strayed(chains, block, f):
+def held_within_prior(chains: CutChains, stage: str, f: Fit, known: Iterable[Parameter]) -> Fit:
+    """A fit of the nominal structure; if a parameter left its prior, a fit that keeps all within theirs."""
+    if not outside_prior(chains, stage, f):
         return f
-    reach = {u.name: STRAYED * NUMBER_SD * abs(u.mean) for u in known if u.name in BLOCKS[block]}
-    held = [replace(u, low=max(u.low, u.mean - reach[u.name]), high=min(u.high, u.mean + reach[u.name]))
-            if u.name in reach else u for u in known]
-    carried = {n: v for n, v in f.values.items() if n not in {u.name for u in held}}
-    residuals = chains.residuals(block)
+    reach = {p.name: OUTSIDE * NOMINAL_SD * abs(p.mean) for p in known if p.name in STAGES[stage]}
+    held = [replace(p, low=max(p.low, p.mean - reach[p.name]), high=min(p.high, p.mean + reach[p.name]))
+            if p.name in reach else p for p in known]
+    carried = {n: v for n, v in f.values.items() if n not in {p.name for p in held}}
+    residuals = chains.residuals(stage)
     return fit(lambda values: residuals({**carried, **values}), held)
 
 
-def _explained(here: Round) -> bool:
-    """Whether what is left passes as noise.
+def _explained(here: SelectionRound) -> bool:
+    """Whether the rest passes as noise.
 
-    Of an unknown rig it may be more than the recording shows of noise, if it follows neither inputs nor states.
+    The noise of an uncalibrated rig is an estimate: a somewhat larger rest passes too if it follows neither inputs nor
+    states.
     """
-    if strayed(here.chains, here.block, here.current):
+    if outside_prior(here.chains, here.stage, here.current):
         return False
-    if _passes_as_noise(here.current, MATERIAL) or not here.guessed:
-        return _passes_as_noise(here.current, MATERIAL)
-    if not _passes_as_noise(here.current, UNSURE):
+    if passes_as_noise(here.current, MATERIAL):
+        return True
+    policy = here.chains.policy
+    if not policy.wide_search or not passes_as_noise(here.current, policy.noise_margin):
         return False
-    shape = shapes(here.chains, here.block, here.current, here.known)[0]
-    return shape.explained <= FOLLOWS * shape.before
+    term = missing_terms(here.chains, here.stage, here.current, here.known)[0]
+    return term.explained <= FOLLOWS * term.before
 
 
-def _passes_as_noise(f: Fit, material: float) -> bool:
-    """Whether so little is left that nothing could explain a material part of it."""
+def passes_as_noise(f: Fit, material: float) -> bool:
+    """Whether the rest is so small that no effect could explain a material part of it.
+
+    Args:
+        f: the fit.
+        material: RMS, in units of a reading's noise, that is material; half of its square passes.
+    """
     return all(float(np.mean(r * r)) < 1.0 + 0.5 * material**2 for r in f.residuals.values())
 
 
 def _material(before: Fit, after: Fit) -> bool:
-    """Whether an effect explains enough of some channel to matter."""
+    """Whether an effect explains a material part of some channel."""
     return any(float(np.mean(r * r)) - float(np.mean(after.residuals[k] ** 2)) > MATERIAL**2
                for k, r in before.residuals.items() if len(r))

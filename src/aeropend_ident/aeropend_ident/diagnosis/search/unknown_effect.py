@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether an effect is there that the catalogue does not know: no other form of a known one would leave as much."""
+"""The verdict `unknown`: whether a stage keeps more of its misfit than another form of a known effect would leave."""
 
 from __future__ import annotations
 
@@ -10,136 +10,145 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis.chain.chain import Chains, of_recording
-from aeropend_ident.diagnosis.chain.priors import free_swinging, nominal_unknowns
+from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.priors import nominal_parameters
+from aeropend_ident.diagnosis.policy import GOOD_ENOUGH
 from aeropend_ident.diagnosis.search import speed_spikes
-from aeropend_ident.diagnosis.search.free_curves import Shape, shapes
-from aeropend_ident.diagnosis.search.search import Findings, not_strayed
-from aeropend_ident.diagnosis.search.selection import GOOD_ENOUGH
+from aeropend_ident.diagnosis.search.findings import Findings
+from aeropend_ident.diagnosis.search.free_curves import MissingTerm, missing_terms
+from aeropend_ident.diagnosis.search.search import held_within_prior
 from aeropend_ident.estimation.map_fit import Fit
+from aeropend_ident.estimation.parameter import Parameter, key
 
 Array = NDArray[np.float64]
 
-FORM = 0.12
-"""Share of the misfit that an effect may leave because a real one has another form than the catalogue's."""
-
-FORM_ELSEWHERE, FORM_OF_SEVERAL = 0.025, 0.01
-"""As `FORM`, where free curves at another place, or at one place instead of effects at several, explain more."""
-
-FORMS_UNKNOWN, FORMS_SWINGING = (0.2, 0.08, 0.08, 0.25), (0.6, 0.6, 0.6, 0.6)
-"""As these three and `KEPT`, of a rig whose numbers nobody knows, and of an arm that swings freely: its form differs
-from the model file's in more than one way, and its noise is not only that of its sensor."""
-
-NOTICEABLE = 1.05
-"""Mean square residual, in units of a reading's noise, from which on a misfit is counted, if it is not by chance."""
-
 BY_CHANCE = 3.0
-"""Standard deviations of a mean square that pass as chance."""
+"""Standard deviations of a mean square that pass as chance: 99.7 %."""
 
-KEPT, VISIBLE = 0.25, 0.005
-"""Share of a channel's own misfit that may stay, and what it must amount to, relative to the channel's spread."""
+VISIBLE = 0.005
+"""RMS of a channel's misfit, relative to the channel's spread, above which it matters (choice)."""
 
 
 @dataclass(frozen=True)
 class UnknownEffect:
-    """Something that the catalogue does not explain: its likeliest shape, and whether it is the largest finding."""
+    """An effect that the catalogue does not hold.
 
-    shape: Shape
-    first: bool
-
-    def document(self) -> dict[str, object]:
-        """Place and curves, for `diagnosis.json`."""
-        return {"place": self.shape.place,
-                "curves": [{"variable": c.variable, "unit": c.unit, "at": c.knot.tolist(), "value": c.value.tolist()}
-                           for c in self.shape.curves]}
-
-
-def found(chains: Chains, findings: Mapping[str, Findings], torque: bool, spikes: bool) -> UnknownEffect | None:
-    """Whether a part of the chain keeps more of its misfit than another form of a known effect would leave.
-
-    What was found there is then taken back: it only stands in for what is not known.
+    Attributes:
+        term: the missing term at its likeliest place.
+        first: whether it is larger than all effects found.
     """
-    def misfits(f: Fit) -> dict[str, Misfit]:
-        return {c: _misfit(chains, c, r) for c, r in f.residuals.items()
-                # false captures that were not found out, and chance, are no misfit of the model
-                if not (spikes and c.startswith("omega")) and not (torque and c.startswith("theta"))}
 
-    known = {b: [u for u in nominal_unknowns(chains, b) if u.name in f.base.values] for b, f in findings.items()}
-    base = {b: misfits(f.base) for b, f in findings.items()}
-    # what numbers that strayed absorb is no misfit of the base, yet an effect explains it
-    held = {b: misfits(not_strayed(chains, b, f.base, known[b])) for b, f in findings.items()}
-    left = {b: misfits(f.final) for b, f in findings.items()}
-    amount = {b: sum(m.amount for m in left[b].values()) for b in findings}
-    captures = speed_spikes.gap(chains) if spikes else 0.0
-
-    def share(b: str, of: Mapping[str, Mapping[str, Misfit]]) -> float:
-        total = sum(m.amount for each in of.values() for m in each.values()) + captures
-        return amount[b] / total if total > 0.0 else 0.0
-
-    form, form_elsewhere, form_of_several, own = FORM, FORM_ELSEWHERE, FORM_OF_SEVERAL, KEPT
-    if chains.fit_nominal:
-        swinging = free_swinging(chains.recordings)
-        form, form_elsewhere, form_of_several, own = FORMS_SWINGING if swinging else FORMS_UNKNOWN
-    shaped: dict[str, Shape] = {}
-    for b, f in findings.items():
-        if not any(m.amount > 0.0 for m in base[b].values()):
-            continue
-        shape = shapes(chains, b, f.base, known[b])[0]
-        elsewhere = bool(f.found) and shape.place not in {h.place for h in f.effects}
-        # several of one place may be one effect of another form; a number has no form
-        several = len({h.place for h in f.effects}) > 1 or any(h.number for h in f.effects)
-        simpler = several and shape.left < f.final.mean_square
-        kept = share(b, base)
-        if (share(b, held) > form or (kept > form_elsewhere and elsewhere) or (kept > form_of_several and simpler)
-                or any(m.remains(held[b][c], own) for c, m in left[b].items())):
-            shaped[b] = shape
-    if not shaped:
-        return None
-    worst = max(shaped, key=lambda b: amount[b])
-    if worst == "motor":
-        f = findings[worst]
-        place = shapes(chains, worst, f.base, known[worst], any_time=True)[0].place
-        shaped[worst] = next(s for s in shapes(chains, worst, f.base, known[worst]) if s.place == place)
-    explained = max((sum(m.amount for m in base[b].values()) - amount[b] for b in findings
-                     if b not in shaped and findings[b].found), default=0.0)
-    explained = max(explained, captures)
-    for b in shaped:
-        findings[b].found.clear()
-        findings[b].rivals.clear()
-        findings[b].final = findings[b].base
-    return UnknownEffect(shaped[worst], sum(m.amount for m in base[worst].values()) > explained)
+    term: MissingTerm
+    first: bool
 
 
 @dataclass(frozen=True)
 class Misfit:
-    """What a fit leaves in a channel: mean square in units of a reading's noise; that; and the channel's spread.
+    """What a fit leaves in a channel.
 
-    `count` readings were fitted; up to `unseen` the mean square passes as noise.
+    Attributes:
+        square: mean square residual, in units of a reading's noise.
+        noise: standard deviation of a reading.
+        spread: standard deviation of the channel.
+        count: readings that were fitted.
+        noticeable: mean square above which a misfit counts.
     """
 
     square: float
     noise: float
     spread: float
     count: int
-    unseen: float = NOTICEABLE
+    noticeable: float
 
     @property
     def amount(self) -> float:
         """Squared gap above the noise, in units of the spread squared; 0 if it passes as noise."""
         shows = max(self.square - 1.0, 0.0) * (self.noise / self.spread) ** 2
-        return shows if self.square > self.unseen + BY_CHANCE * math.sqrt(2.0 / self.count) else 0.0
+        return shows if self.square > self.noticeable + BY_CHANCE * math.sqrt(2.0 / self.count) else 0.0
 
-    def remains(self, base: Misfit, kept: float = KEPT) -> bool:
-        """Whether too much of a channel's own misfit is left, of a size that matters."""
+    def remains(self, base: Misfit, kept: float) -> bool:
+        """Whether too much of a channel's own misfit is left.
+
+        Args:
+            base: misfit of the nominal structure.
+            kept: share of it that may stay.
+        """
         return (self.square > GOOD_ENOUGH**2 and self.square - 1.0 > kept * (base.square - 1.0)
                 and math.sqrt(self.square) * self.noise > VISIBLE * self.spread)
 
 
-def _misfit(chains: Chains, channel: str, r: Array) -> Misfit:
-    name, k = of_recording(channel)
+Misfits = Mapping[str, Mapping[str, Misfit]]
+"""Stage -> channel -> misfit."""
+
+
+def judge(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool, spikes: bool
+          ) -> tuple[UnknownEffect | None, dict[str, Findings]]:
+    """Look for an unknown effect.
+
+    Args:
+        chains: cut.
+        findings: stage -> what was found.
+        gust: whether `gust` was detected: the rest of the angle is then no misfit of the model.
+        spikes: whether `speed_spikes` was detected: false captures that were not recognised are then no misfit.
+
+    Returns:
+        The unknown effect, if there is one, and the findings. Findings in its stage are taken back: they only
+        approximated it.
+    """
+    def misfits(fits: Mapping[str, Fit]) -> Misfits:
+        return {b: {c: _misfit(chains, c, r) for c, r in f.residuals.items()
+                    if not (spikes and key(c).name == "omega") and not (gust and key(c).name == "theta")}
+                for b, f in fits.items()}
+
+    limits = chains.policy.unknown
+    known = {b: [p for p in nominal_parameters(chains, b) if p.name in f.base.values] for b, f in findings.items()}
+    base = misfits({b: f.base for b, f in findings.items()})
+    # a parameter outside its prior absorbs part of the misfit of the nominal structure
+    held = misfits({b: held_within_prior(chains, b, f.base, known[b]) for b, f in findings.items()})
+    left = misfits({b: f.final for b, f in findings.items()})
+    amount = {b: sum(m.amount for m in left[b].values()) for b in findings}
+    captures = speed_spikes.squared_gap(chains) if spikes else 0.0
+
+    def share(b: str, of: Misfits) -> float:
+        total = sum(m.amount for each in of.values() for m in each.values()) + captures
+        return amount[b] / total if total > 0.0 else 0.0
+
+    terms: dict[str, MissingTerm] = {}
+    for b, f in findings.items():
+        if not any(m.amount > 0.0 for m in base[b].values()):
+            continue
+        term = missing_terms(chains, b, f.base, known[b])[0]
+        elsewhere = bool(f.found) and term.place not in {h.place for h in f.effects}
+        # several effects of one place may be one effect of another form; a parameter has no form
+        several = len({h.place for h in f.effects}) > 1 or any(h.parameter for h in f.effects)
+        simpler = several and term.left < f.final.mean_square
+        kept = share(b, base)
+        if (share(b, held) > limits.form or (kept > limits.form_elsewhere and elsewhere)
+                or (kept > limits.form_of_several and simpler)
+                or any(m.remains(held[b][c], limits.kept) for c, m in left[b].items())):
+            terms[b] = term
+    if not terms:
+        return None, dict(findings)
+    worst = max(terms, key=lambda b: amount[b])
+    term = _placed(chains, worst, findings[worst].base, known[worst]) if worst == "motor" else terms[worst]
+    explained = max((sum(m.amount for m in base[b].values()) - amount[b] for b in findings
+                     if b not in terms and findings[b].found), default=0.0)
+    explained = max(explained, captures)
+    unknown = UnknownEffect(term, sum(m.amount for m in base[worst].values()) > explained)
+    return unknown, {b: f.nothing() if b in terms else f for b, f in findings.items()}
+
+
+def _placed(chains: CutChains, stage: str, base: Fit, known: list[Parameter]) -> MissingTerm:
+    """The missing term at the place that a term free in time fits best: it need not know what the term depends on."""
+    place = missing_terms(chains, stage, base, known, any_time=True)[0].place
+    return next(t for t in missing_terms(chains, stage, base, known) if t.place == place)
+
+
+def _misfit(chains: CutChains, channel: str, r: Array) -> Misfit:
+    name, k = key(channel).name, key(channel).recording
     s = chains.each[k].signals
     noise = s.sigma[name]
     if name == "omega" and s.pulses:
         noise = float(np.sqrt(np.mean(s.pulses.sigma[s.pulses.index < s.train] ** 2)))
-    unseen = GOOD_ENOUGH**2 if chains.fit_nominal else NOTICEABLE  # the noise too is only what the recording shows
-    return Misfit(float(np.mean(r * r)), noise, max(float(np.nanstd(s.channel(name)[:s.train])), noise), len(r), unseen)
+    spread = max(float(np.nanstd(s.channel(name)[:s.train])), noise)
+    return Misfit(float(np.mean(r * r)), noise, spread, len(r), chains.policy.unknown.noticeable)

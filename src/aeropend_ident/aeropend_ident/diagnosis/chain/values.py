@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Values by name: what they mean for a model. `estimation.parameter.key` knows the form of the names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from aeropend_ident.estimation.parameter import key
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import PARAMETERS, Model
+
+Values = Mapping[str, float]
+
+STAGES: dict[str, tuple[str, ...]] = {
+    "actuator": ("k0", "k1", "k2", "k3"),
+    "motor": ("R_a", "L_a", "K_e", "K_t", "J_m", "B_m", "k_load"),
+    "arm": ("k_thrust", "mgd_over_J", "c_over_J", "L_over_J"),
+}
+"""The stages of the cut chain and the parameters of the model in each."""
+
+CHANNELS_OF = {"actuator": ("v_a",), "motor": ("i_a", "omega"), "arm": ("theta",)}
+"""The channels that each stage predicts."""
+
+PLACE_OF_PARAMETER = {
+    **dict.fromkeys(STAGES["actuator"], "actuator"), **dict.fromkeys(("R_a", "L_a", "K_e"), "electrical"),
+    **dict.fromkeys(("K_t", "J_m", "B_m", "k_load"), "rotor"), "k_thrust": "thrust", "L_over_J": "thrust",
+    "mgd_over_J": "arm", "c_over_J": "arm",
+}
+"""The place in the chain of each parameter of the model."""
+
+PLACE_OF_CHANNEL = {"v_a": "actuator", "i_a": "electrical", "omega": "rotor", "theta": "arm"}
+"""The place whose misfit a channel shows first."""
+
+
+def with_values(model: Model, values: Values) -> Model:
+    """The model with these values; initial states are left out.
+
+    Args:
+        model: gives the rest.
+        values: by name, of one recording.
+    """
+    numbers, measuring = dict(model.model), dict(model.sensing)
+    effects = {k: dict(v) for k, v in model.effects.items()}
+    for name, value in values.items():
+        k = key(name)
+        if not k.owner:
+            numbers[name] = value
+        elif k.owner == "sensing":
+            measuring[k.name] = value
+        elif not k.is_initial:
+            effects.setdefault(k.owner, {})[k.name] = value
+    return Model(model.name, numbers, measuring, effects)
+
+
+def neutral(model: Model, name: str) -> float:
+    """The value at which an effect is absent, or a parameter is nominal."""
+    k = key(name)
+    return CATALOGUE[k.owner].parameters[k.name].neutral if k.owner else model.model[k.name]
+
+
+def clipped(name: str, value: float) -> float:
+    """A value within the range of its parameter."""
+    k = key(name)
+    p = CATALOGUE[k.owner].parameters[k.name] if k.owner else PARAMETERS[f"model.{k.name}"]
+    return min(max(value, p.low), p.high)
+
+
+def of_rig(values: Values) -> dict[str, float]:
+    """The values that hold for the rig: without initial states; those that differ between recordings as their mean."""
+    out: dict[str, list[float]] = {}
+    for name, value in values.items():
+        k = key(name)
+        if not k.is_initial:
+            out.setdefault(k.plain, []).append(value)
+    return {name: float(np.mean(all_)) for name, all_ in out.items()}

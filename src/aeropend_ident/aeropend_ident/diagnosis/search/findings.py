@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the search found in each stage of the chain. Nothing here is changed in place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
+from aeropend_ident.estimation.map_fit import Fit
+from aeropend_ident.estimation.parameter import Parameter
+
+
+@dataclass(frozen=True)
+class RankedHypothesis:
+    """A hypothesis after its fit.
+
+    Attributes:
+        hypothesis: what was fitted.
+        fit: of the hypothesis on top of what was found before.
+        gain: log evidence over no further effect, prior odds included.
+        probability: among the hypotheses of its selection round.
+    """
+
+    hypothesis: Hypothesis
+    fit: Fit
+    gain: float
+    probability: float
+
+
+Selection = tuple[RankedHypothesis, ...]
+"""The hypotheses of one selection round, the best first."""
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What was found in one stage of the chain.
+
+    Attributes:
+        stage: its name.
+        base: the fit with the nominal structure.
+        final: the fit with all that was found.
+        found: a selection for each effect found, in the order found; its first entry is the effect.
+        rivals: the selection in which nothing was found.
+        cut_short: the search was ended by its budget.
+    """
+
+    stage: str
+    base: Fit
+    final: Fit
+    found: tuple[Selection, ...] = ()
+    rivals: Selection = ()
+    cut_short: bool = False
+
+    @property
+    def effects(self) -> list[Hypothesis]:
+        """The hypotheses found."""
+        return [selection[0].hypothesis for selection in self.found]
+
+    @property
+    def selections(self) -> list[Selection]:
+        """All selections, that in which nothing was found last."""
+        return [*self.found, self.rivals]
+
+    def without(self, selection: Selection, final: Fit | None = None) -> Findings:
+        """The findings without one of the effects; `final`: the fit of the others."""
+        return replace(self, found=tuple(s for s in self.found if s is not selection), final=final or self.final)
+
+    def nothing(self) -> Findings:
+        """The findings with all effects taken back."""
+        return replace(self, found=(), rivals=(), final=self.base)
+
+
+def adopted(known: list[Parameter], hypothesis: Hypothesis, start: int = 0) -> list[Parameter]:
+    """The known parameters with those of a hypothesis; where both name one, the hypothesis' counts."""
+    own = hypothesis.starts[start]
+    return [*(p for p in known if p.name not in {o.name for o in own}), *own]
+
+
+def drop_unneeded(findings: Findings, without: Callable[[Findings, Hypothesis], Fit],
+                  lost: Callable[[Findings, Fit], float], least: int = 0) -> Findings:
+    """Take out effects that are not needed beside the others, the least needed first (backward elimination).
+
+    Args:
+        findings: of a stage.
+        without: fits what was found without one effect.
+        lost: log evidence that such a fit has less than the final fit.
+        least: number of effects that stay in any case.
+    """
+    while len(findings.found) > least:
+        tried = [(selection, without(findings, selection[0].hypothesis)) for selection in findings.found]
+        needed = [lost(findings, f) + selection[0].hypothesis.log_odds for selection, f in tried]
+        k = needed.index(min(needed))
+        if needed[k] > 0.0:
+            break
+        findings = findings.without(*tried[k])
+    return findings
+
+
+def places(findings: Mapping[str, Findings]) -> list[str]:
+    """The places of all effects found."""
+    return [h.place for f in findings.values() for h in f.effects]

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A parameter to be estimated with its prior, and the names of values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Key(NamedTuple):
+    """The name of a value or of a channel, in its parts.
+
+    `R_a` is a parameter of the model, `coulomb_friction.accel` one of an effect, `sensing.angle_filter_tau` one of the
+    measurement chain, `initial.theta@1` the initial angle of recording 1. Recording 0 has no suffix.
+
+    Attributes:
+        owner: the part before the dot; "" for a parameter of the model, or a channel.
+        name: the part after it.
+        recording: number of the recording.
+    """
+
+    owner: str
+    name: str
+    recording: int
+
+    @property
+    def is_initial(self) -> bool:
+        """Whether this is a part of an initial state."""
+        return self.owner == "initial"
+
+    @property
+    def plain(self) -> str:
+        """The name without the recording."""
+        return f"{self.owner}.{self.name}" if self.owner else self.name
+
+    def of(self, recording: int) -> str:
+        """The name of the same value of another recording."""
+        return f"{self.plain}@{recording}" if recording else self.plain
+
+
+@cache
+def key(name: str) -> Key:
+    """Split a name; the only place that knows its form."""
+    plain, _, recording = name.partition("@")
+    owner, dot, parameter = plain.partition(".")
+    return Key(owner, parameter, int(recording or 0)) if dot else Key("", plain, int(recording or 0))
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter to be estimated, with a normal or log-normal prior.
+
+    Attributes:
+        name: see `Key`. `x@k` acts on the channels of recording k.
+        mean: of the prior; its median if `log`.
+        sd: standard deviation of the prior; that of the logarithm if `log`.
+        low: lower bound; positive if `log`.
+        high: upper bound.
+        start: where a search starts; None: at the mean.
+        log: whether the prior is log-normal.
+    """
+
+    name: str
+    mean: float
+    sd: float
+    low: float = -np.inf
+    high: float = np.inf
+    start: float | None = None
+    log: bool = False
+
+    @property
+    def begin(self) -> float:
+        """Where a search starts."""
+        return self.mean if self.start is None else self.start
+
+    def to_standard(self, value: float) -> float:
+        """A value as a standard normal variable z."""
+        if self.log:
+            return (np.log(value) - np.log(self.mean)) / self.sd if value > 0.0 else -np.inf
+        return (value - self.mean) / self.sd
+
+    def value(self, z: float) -> float:
+        """The inverse of `to_standard`."""
+        return float(self.mean * np.exp(self.sd * z)) if self.log else float(self.mean + self.sd * z)
+
+    def slope(self, z: float) -> float:
+        """Derivative of the value with respect to z."""
+        return self.value(z) * self.sd if self.log else self.sd
+
+
+def started(parameters: Iterable[Parameter], values: Mapping[str, float]) -> list[Parameter]:
+    """The parameters with these values as starts; others keep their start."""
+    return [replace(p, start=values.get(p.name, p.start)) for p in parameters]

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""White noise and resolution of a channel, estimated from its readings alone."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import comb
+
+Array = NDArray[np.float64]
+
+ORDERS = (2, 3, 4, 6, 8)
+"""Orders of the differences that estimate noise at irregular stamps: a higher order removes more of the motion."""
+
+OUTLIERS = 0.01
+"""Share of the differences that is left out as spikes (choice)."""
+
+FEWEST = 10
+"""Readings, or differences, below which no noise is estimated (choice)."""
+
+LEAST_NOISE = 1e-9
+"""Smallest standard deviation of a reading in its unit: a residual is divided by it."""
+
+LONGEST_STEP = 50.0
+"""Steps of the resolution between neighbouring levels, in the median, above which a channel counts as continuous."""
+
+
+def resolution(x: Array) -> float:
+    """Step between the values that a channel takes.
+
+    Args:
+        x: (N,) readings, NaN where missing.
+
+    Returns:
+        The step in the unit of x; 0 if the channel takes any value.
+    """
+    x = x[np.isfinite(x)]
+    levels = np.unique(x)
+    if len(levels) < 3:
+        return float(levels[-1] - levels[0]) if len(levels) == 2 else 0.0
+    steps = np.diff(levels)
+    steps = steps[steps > 1e-7 * (levels[-1] - levels[0])]
+    least = float(steps.min())
+    multiple = np.rint(steps / least)
+    if np.mean(np.abs(steps / least - multiple) < 0.1) < 0.95 or np.median(multiple) > LONGEST_STEP:
+        return 0.0
+    return float(steps.sum() / multiple.sum())
+
+
+def white_noise(x: Array) -> float:
+    """Standard deviation of a reading on a uniform grid, from second differences.
+
+    The median makes the estimate robust against steps; a coarse channel counts with its quantisation noise.
+
+    Args:
+        x: (N,) readings, NaN where missing.
+
+    Returns:
+        Standard deviation in the unit of x, at least `LEAST_NOISE`.
+    """
+    x = x[np.isfinite(x)]
+    if len(x) < FEWEST:
+        return 1e-6
+    levels = np.unique(x)
+    step = float(np.median(np.diff(levels))) if 1 < len(levels) < len(x) / 10 else 0.0
+    white = float(np.median(np.abs(np.diff(x, 2)))) / 0.6745 / math.sqrt(6.0)
+    return max(white, step / math.sqrt(12.0), 1e-6 * float(np.ptp(x)), LEAST_NOISE)
+
+
+def white_noise_at(t: Array, x: Array) -> float:
+    """Standard deviation of the white noise of a channel read at irregular instants.
+
+    Differences of several orders are tried; the least one holds the least motion. A trimmed RMS is taken, as the
+    median of a coarse channel would be a whole step.
+
+    Args:
+        t: [s] (N,) instants.
+        x: (N,) readings, NaN where missing.
+
+    Returns:
+        Standard deviation in the unit of x; 0 if there are too few readings.
+    """
+    known = np.isfinite(x)
+    t, x = t[known], x[known]
+    usual = np.abs(np.diff(t) / np.median(np.diff(t)) - 1.0) < 0.2
+    found = []
+    for order in ORDERS:
+        if len(x) < order + FEWEST:
+            break
+        even = np.lib.stride_tricks.sliding_window_view(usual, order).all(axis=1)
+        d = np.diff(x, order)[even]
+        if len(d) >= FEWEST:
+            d = np.sort(np.abs(d))[:math.ceil((1.0 - OUTLIERS) * len(d))]
+            found.append(float(np.sqrt(np.mean(d * d))) / math.sqrt(float(comb(2 * order, order))))
+    return min(found, default=0.0)
+
+
+def reading_noise_at(t: Array, x: Array) -> float:
+    """Standard deviation of a reading at irregular instants: the larger of white noise and quantisation noise.
+
+    Args:
+        t: [s] (N,) instants.
+        x: (N,) readings, NaN where missing.
+
+    Returns:
+        Standard deviation in the unit of x, at least `LEAST_NOISE`.
+    """
+    return max(white_noise_at(t, x), resolution(x) / math.sqrt(12.0),
+               1e-5 * float(np.nanmax(x) - np.nanmin(x)), LEAST_NOISE)
