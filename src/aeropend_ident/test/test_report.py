@@ -313,7 +313,7 @@ def test_regions_are_marked_where_the_misfit_is_drawn(several, nominal):
     page = Page(rendered(several))
     marked = [a for a in page.all("rect") if a.get("class") == "range"]
     assert len(marked) == len(regions)
-    assert all(0.0 <= float(a["x"]) <= float(a["x"]) + float(a["width"]) <= page.WIDTH + 0.2 for a in marked)
+    assert all(0.0 <= float(a["x"]) <= float(a["x"]) + float(a["width"]) <= report_page.WIDTH + 0.2 for a in marked)
     said = [a["aria-label"] for a in page.all("svg") if a.get("aria-label", "").startswith("Misfit")]
     assert len(said) == 6
     assert sum("stands out" in text for text in said) == len(regions)

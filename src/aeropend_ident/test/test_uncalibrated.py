@@ -227,9 +227,9 @@ def test_an_effect_of_the_drive_is_identified_together_with_the_numbers(effect, 
     model, read = unknown(4, {effect: {parameter: size}}, duration=25.0)
     signals = from_uncalibrated(read, BENCH.sensing)
     misled, _ = fit_nominal_model(BENCH, [signals])
-    (size,) = next(h.own for h in hypotheses(BENCH) if h.effect == effect)
-    found = fit_with_effect(misled, [signals], size)
-    assert found[unknown_.name] == pytest.approx(size, rel=0.25)
+    (own,) = next(h.own for h in hypotheses(BENCH) if h.effect == effect)
+    found = fit_with_effect(misled, [signals], own)
+    assert found[own.name] == pytest.approx(size, rel=0.25)
     assert found["mgd_over_J"] == pytest.approx(model.model["mgd_over_J"], rel=0.05)
 
 
