@@ -53,13 +53,11 @@ def free_run(model: Model, signals: Signals, values: Mapping[str, float] | None 
                            theta=values.get("initial.theta", 0.0), theta_dot=values.get("initial.theta_dot", 0.0),
                            thrust=float(actuator.thrust(n, omega)))
     run = dynamics.simulate(m, signals.duty, signals.period, state)
-    e = m.effects
     return {
         "theta": sensing.angle_reading(run.theta, run.theta_dot, sensing.prepare(m, signals.period)),
         "omega": _held_speed(run, signals),
-        "i_a": (run.i_a * (1.0 + e.get("current_gain", {}).get("gain", 0.0))
-                + e.get("current_offset", {}).get("bias", 0.0)),
-        "v_a": run.v_a + e.get("voltage_offset", {}).get("bias", 0.0),
+        "i_a": sensing.read_current(m, run.i_a),
+        "v_a": sensing.read_voltage(m, run.v_a),
     }
 
 

@@ -99,8 +99,7 @@ class CutChain:
         # the duty before the recording is taken from the first voltage: with a delay it acts for a while
         first = s.v_a[0] if np.isfinite(s.v_a[0]) else actuator.voltage_at(n, values.get("initial.omega", 0.0))
         v = of(n, s.duty, m.effects, s.period, before=float(actuator.duty(n, first)))
-        v = v - m.effects.get("supply_sag", {}).get("r_supply", 0.0) * self.current
-        return v + m.effects.get("voltage_offset", {}).get("bias", 0.0)
+        return sensing.read_voltage(m, actuator.terminal_voltage(m, v, self.current))
 
     def actuator_residuals(self, values: Values) -> dict[str, Array]:
         """Residual of the voltage over the training part, in units of its noise."""
@@ -135,7 +134,7 @@ class CutChain:
         v = self._voltage(acting, actuator.acting_voltage)
         same = acting == self.actuator_values
         v = v + (self.unexplained_voltage if same else self._unexplained_voltage(acting))
-        delay = self.valued(acting).effects.get("command_delay", {}).get("delay", 0.0)
+        delay = self.valued(acting).effect("command_delay", "delay")
         early = np.arange(len(s)) < math.floor(delay / s.period + 1e-9)  # set by duties from before the recording
         return np.where(early & np.isfinite(s.v_a), s.v_a, v)
 
@@ -153,16 +152,14 @@ class CutChain:
         """
         m = self.valued(values)
         # the supply acts before the terminals: the measured voltage holds its sag
-        effects = {k: p for k, p in m.effects.items() if k != "supply_sag"}
-        bias = m.effects.get("voltage_offset", {}).get("bias", 0.0)
-        m = m.with_effects(effects)
+        m = m.with_effects({k: p for k, p in m.effects.items() if k != "supply_sag"})
         first = float(self.signals.i_a[0]) if np.isfinite(self.signals.i_a[0]) else 0.0
         state = dynamics.State(i_a=first, omega=values.get("initial.omega", 0.0))
         if not self.signals.has("v_a"):
             voltage = self._voltage(values, actuator.acting_voltage)
         else:
             voltage = self._motor_input(values) if DELAY in values else self.voltage
-        voltage = voltage[:stop] - bias
+        voltage = sensing.true_voltage(m, voltage[:stop])
         out = np.empty((3, len(voltage)))
         dynamics.run_motor(voltage, state, *dynamics.prepare(m, self.signals.period), out)
         return out[0], out[1], out[2]
@@ -173,10 +170,8 @@ class CutChain:
         i_a, omega, angle = self.motor(values, s.train)
         residuals = {}
         if s.has("i_a"):
-            m = self.valued(values).effects
-            gain = 1.0 + m.get("current_gain", {}).get("gain", 0.0)
-            offset = m.get("current_offset", {}).get("bias", 0.0)
-            residuals["i_a"] = self._train(s.i_a, gain * i_a + offset) / s.sigma["i_a"]
+            read = sensing.read_current(self.valued(values), i_a)
+            residuals["i_a"] = self._train(s.i_a, read) / s.sigma["i_a"]
         if s.pulses is not None:
             p = s.pulses
             use = (p.index < s.train) & ~p.false

@@ -388,8 +388,8 @@ def _lift(model: Model, s: Signals) -> Array:
     out = np.empty((3, len(v)))
     dynamics.run_motor(v, state, *dynamics.prepare(model.with_effects({}), s.period), out)
     pivot = dynamics.THRUST_PIVOT_SPEED
-    u = pivot**2 * (np.maximum(out[1], 0.0) / pivot) ** model.effects.get("thrust_exponent", {}).get("n", 2.0)
-    tau = model.effects.get("thrust_lag", {}).get("tau", 0.0)
+    u = pivot**2 * (np.maximum(out[1], 0.0) / pivot) ** model.effect("thrust_exponent", "n")
+    tau = model.effect("thrust_lag", "tau")
     keep = math.exp(-s.period / tau) if tau > 0.0 else 0.0
     return lfilter([1.0 - keep], [1.0, -keep], u, zi=[keep * u[0]])[0] if keep else u
 

@@ -133,7 +133,7 @@ def _of_angle(model: Model, recordings: Sequence[Signals]) -> list[Parameter]:
 
     arm = [log("mgd_over_J", 0.7), Parameter("c_over_J", m["c_over_J"], max(m["c_over_J"], 0.3), 0.0, 1e3)]
     if free_swinging(recordings):
-        return [*arm, Parameter(ZERO, model.effects.get("angle_offset", {}).get("bias", 0.0), 0.3)]
+        return [*arm, Parameter(ZERO, model.effect("angle_offset", "bias"), 0.3)]
     full = float(actuator.voltage(m, 1.0))
     heaviest = HEAVIEST * (1.0 + HEAVIEST) * m["K_e"] ** 2 * m["K_t"] / (m["R_a"] * full)
     quickest = max(QUICKEST, 0.6 * max(s.period for s in recordings)) * m["K_t"] * m["K_e"] / m["R_a"]
@@ -154,7 +154,7 @@ def state_of_arm(model: Model, s: Signals, recording: int = 0) -> list[Parameter
     first = known[:max(6, int(np.searchsorted(known, known[0] + FIRST_READINGS / s.period)))]
     t = first * s.period
     _, rate, angle = np.polyfit(t, s.theta[first], 2) if len(first) > 3 else (0.0, 0.0, float(s.theta[first[0]]))
-    zero = model.effects.get("angle_offset", {}).get("bias", 0.0)
+    zero = model.effect("angle_offset", "bias")
     found = [Parameter(_initial("theta", recording), float(angle) - zero, 0.3),
              Parameter(_initial("theta_dot", recording), float(rate), 5.0)]
     if s.driven and not s.has("omega") and float(s.duty[0]) >= STILL:

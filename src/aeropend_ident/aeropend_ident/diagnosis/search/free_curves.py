@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
-from aeropend_ident.diagnosis.search.gauss_markov import transition
 from aeropend_ident.estimation.map_fit import Fit, Search
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.pulses import mean_speed
@@ -26,6 +25,7 @@ from aeropend_ident.signals.smoothing import lag
 from aeropend_ident.signals.statistics import effective_sample_size
 from aeropend_sim.compiled import njit
 from aeropend_sim.model import sensing
+from aeropend_sim.model.dynamics import linear_arm
 
 Array = NDArray[np.float64]
 
@@ -152,7 +152,7 @@ def arm_response(drive: Array, stiffness: Array, damping: float, tau: float, h: 
         x = v = s1 = s2 = 0.0
         for k in range(drive.shape[1]):
             out[j, k] = s2
-            a, b, c, d, e, f = transition(stiffness[k], damping, h)
+            a, b, c, d, e, f = linear_arm(stiffness[k], damping, h)
             u = drive[j, k]
             x, v = a * x + b * v + c * u, d * x + e * v + f * u
             s1 = keep * s1 + (1.0 - keep) * x
@@ -259,7 +259,7 @@ def angle_response(chain: CutChain, values: Mapping[str, float], drive: Array) -
     """Response (K, N) of the angle to torques over inertia (K, N), by channel."""
     model = chain.valued(values)
     n = model.numbers()
-    tau = model.sensing["angle_filter_tau"] + model.effects.get("encoder_lag", {}).get("tau", 0.0)
+    tau = model.sensing["angle_filter_tau"] + model.effect("encoder_lag", "tau")
     stiffness = n["mgd_over_J"] * np.cos(chain.arm_motion(values)[0])
     return {"theta": arm_response(drive, stiffness, n["c_over_J"], tau, chain.signals.period)}
 

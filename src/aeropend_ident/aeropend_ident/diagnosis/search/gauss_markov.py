@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from aeropend_ident.signals.smoothing import block_mean
 from aeropend_sim.compiled import njit
+from aeropend_sim.model.dynamics import linear_arm
 
 Array = NDArray[np.float64]
 
@@ -90,7 +91,7 @@ def _filter(r: Array, stiffness: Array, damping: float, h: float, noise: float, 
     total = 0.0
     for k in range(r.shape[0]):
         if k > 0:
-            a, b, c, d, e, f = transition(stiffness[k], damping, h)
+            a, b, c, d, e, f = linear_arm(stiffness[k], damping, h)
             x0, x1, x2 = a * x0 + b * x1 + c * x2, d * x0 + e * x1 + f * x2, decay * x2
             s00, s01, s02 = a * p00 + b * p01 + c * p02, a * p01 + b * p11 + c * p12, a * p02 + b * p12 + c * p22
             s10, s11, s12 = d * p00 + e * p01 + f * p02, d * p01 + e * p11 + f * p12, d * p02 + e * p12 + f * p22
@@ -114,24 +115,6 @@ def _filter(r: Array, stiffness: Array, damping: float, h: float, noise: float, 
     return total
 
 
-@njit()
-def transition(stiffness: float, damping: float, h: float) -> tuple[float, float, float, float, float, float]:
-    """Transition of the linear arm over a step, to second order in the step.
-
-    Args:
-        stiffness: [1/s²] of the arm at its angle.
-        damping: [1/s] of the arm.
-        h: [s] step.
-
-    Returns:
-        First two rows of the transition matrix of (δ, δ̇, w).
-    """
-    half = 0.5 * h * h
-    return (1.0 - half * stiffness, h - half * damping, half,
-            -h * stiffness + half * damping * stiffness, 1.0 - h * damping + half * (damping * damping - stiffness),
-            h - half * damping)
-
-
 @njit(nogil=True)
 def _smooth(kept: Array, stiffness: Array, damping: float, h: float, tau: float, torque: Array) -> None:
     """Rauch-Tung-Striebel smoother over `kept` of the filter; fills `torque` [rad/s²] (M,)."""
@@ -141,7 +124,7 @@ def _smooth(kept: Array, stiffness: Array, damping: float, h: float, tau: float,
     f = np.zeros((3, 3))
     f[2, 2] = math.exp(-h / tau)
     for k in range(n - 2, -1, -1):
-        f[0, 0], f[0, 1], f[0, 2], f[1, 0], f[1, 1], f[1, 2] = transition(stiffness[k + 1], damping, h)
+        f[0, 0], f[0, 1], f[0, 2], f[1, 0], f[1, 1], f[1, 2] = linear_arm(stiffness[k + 1], damping, h)
         gain = symmetric(kept[k, 3:9]) @ f.T @ np.linalg.inv(symmetric(kept[k + 1, 12:18]) + 1e-15 * np.eye(3))
         x = kept[k, :3] + gain @ (x - kept[k + 1, 9:12])
         torque[k] = x[2]
