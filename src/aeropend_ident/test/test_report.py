@@ -389,7 +389,7 @@ def test_a_number_that_moved_is_marked(friction):
     marked = [text for stack, text in page.texts if stack[-2:] == ("td", "span")]
     assert "+20\N{NO-BREAK SPACE}%" in marked
     off = [a for tag, a, stack in page.tags if a.get("class") == "off"]
-    assert len(off) == 1 + sum(abs(n["value"] / n["nominal"] - 1.0) > page.OFF
+    assert len(off) == 1 + sum(abs(n["value"] / n["nominal"] - 1.0) > report_page.OFF
                                for name, n in numbers.items() if name not in moved)
 
 
