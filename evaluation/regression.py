@@ -5,7 +5,7 @@
     python -m evaluation.regression run FOLDER NAME          results of this tree, in FOLDER/NAME
     python -m evaluation.regression compare FOLDER OLD NEW   every number that differs (--rtol 0: to the bit)
 
-The recordings: 30 of calibrated rigs, 12 of uncalibrated driven rigs, 12 free decays and 6 sets of several recordings
+The recordings: 30 of calibrated rigs, 12 of uncalibrated driven rigs, 12 free decays and 5 sets of several recordings
 are diagnosed; 6 are identified; beside them the control table and a run of the plant with all effects.
 """
 
@@ -32,21 +32,21 @@ from aeropend_ident.commands import identify
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.results import document
 from aeropend_ident.signals.from_bag import from_recording, signals_of
-from aeropend_ident.testing import bags
+from aeropend_ident.testing import bags, rigs
 from aeropend_sim.model import rig
 from aeropend_sim.model.effects import CATALOGUE
-from aeropend_sim.model.parameters import load
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, load
 from evaluation import control_table
 from evaluation.blind import __main__ as blind
 from evaluation.blind import cases, plant, uncalibrated
 
 SEED = 60_2026
 CALIBRATED, DRIVEN, DECAYS = 30, 12, 12
-SETS = {
-    "calibrated": [("c000", "c003"), ("c001", "c004", "c007"), ("c002", "c005")],
-    "uncalibrated": [("u000", "u001"), ("d000", "d003"), ("d001", "d004", "d007")],
-}
-"""Recordings that are fitted together, though of different rigs: what matters is that the result stays."""
+ONE_RIG = {"p": ("coulomb_friction", {}), "q": ("brush_drop", {}), "r": ("", {}), "s": ("thrust_lag", {"tau": 0.2}),
+           "t": ("quadratic_drag", {})}
+"""Effects of rigs that are recorded several times; the last two with angle and command alone."""
+SETS = {"calibrated": [("p0", "p1"), ("q0", "q1", "q2"), ("r0", "r1")], "uncalibrated": [("s0", "s1"), ("t0", "t1")]}
+"""Recordings that are fitted together."""
 TEXTS = {"notes", "why", "unexplained"}
 """Keys of sentences for people, which are not compared."""
 IDENTIFIED = [("c000", "weak"), ("c001", "sindy"), ("c002", "discrepancy-weak"), ("c003", "discrepancy-sindy"),
@@ -74,6 +74,17 @@ def inputs(folder: Path, jobs: int) -> None:
         _, columns, period = uncalibrated.decay(f"d{k:03d}", damping, nominal.model, SEED + 200 + k)
         bags.write(place / f"d{k:03d}", columns, round(period * 1e9))
 
+    def repeated(letter: str, k: int) -> None:
+        effect, parameters = ONE_RIG[letter]
+        duty = rigs.steps(25.0, 10 * ord(letter) + k)
+        columns, _ = rig.record(rigs.drawn_rig(ord(letter), {effect: parameters} if effect else {}), duty, k)
+        columns = {**{c: columns[c] for c in ("theta", "omega", "i_a", "v_a")}, "duty": duty}
+        if letter in "st":
+            columns |= {c: np.full(len(duty), np.nan) for c in ("omega", "i_a", "v_a")}
+        bags.write(place / f"{letter}{k}", columns, round(SAMPLE_PERIOD * 1e9))
+
+    for letter, k in {(name[0], int(name[1:])) for sets in SETS.values() for names in sets for name in names}:
+        repeated(letter, k)
     effects = ["", "", *np.random.default_rng(SEED).permutation(uncalibrated.SHOWS)[:DRIVEN - 2].tolist()]
     Parallel(jobs)([*(delayed(calibrated)(k, row) for k, row in enumerate(blind.plan(CALIBRATED, SEED))),
                     *(delayed(driven)(k, e) for k, e in enumerate(effects)),
@@ -149,7 +160,7 @@ def run(folder: Path, name: str, jobs: int, only: list[str]) -> None:
     for kind, sets in SETS.items():
         for names in sets:
             add(f"set_{kind}_{'_'.join(names)}", diagnosed, folder, names, fit_nominal=kind == "uncalibrated")
-    for path in sorted((folder / "recordings").iterdir()):
+    for path in sorted((folder / "recordings").glob("[cud]*")):
         add(path.name, diagnosed, folder, (path.name,), fit_nominal=not path.name.startswith("c"))
 
     def one(task: str) -> None:

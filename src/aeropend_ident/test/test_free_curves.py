@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A term that the model lacks is found at the place where it acts, and drawn as what it is."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -69,6 +71,22 @@ def test_two_recordings_of_one_rig_agree_on_the_place():
     best = found("motor", recording({}, bent_current), recording({}, bent_current, duration=12.0))[0]
     assert best.place == "sensing"
     assert best.left < 0.4 * best.before
+
+
+def test_a_recording_in_which_a_channel_hardly_varies_still_counts():
+    """Its current takes too few levels for knots of its own."""
+    whole = recording({}, bent_current)
+    n = len(whole)
+    coarse = replace(whole, i_a=np.where(np.arange(n) < n // 2, 0.0, 0.2))
+    chains = CutChains(BENCH, [whole, coarse])
+    base = fit(chains.residuals("motor"), nominal_parameters(chains, "motor"))
+    both = missing_terms(chains, "motor", base, nominal_parameters(chains, "motor"))
+    swapped = CutChains(BENCH, [coarse, whole])
+    base = fit(swapped.residuals("motor"), nominal_parameters(swapped, "motor"))
+    other = missing_terms(swapped, "motor", base, nominal_parameters(swapped, "motor"))
+    assert [t.place for t in both] == [t.place for t in other]
+    for a, b in zip(both, other, strict=True):
+        assert a.left == pytest.approx(b.left, rel=1e-3)
 
 
 def test_nothing_missing_leaves_nothing_to_explain():

@@ -215,7 +215,7 @@ class _Stage:
         chain: of the recording.
         values: of the fit that the curves are added to.
         variables: (N,) by name.
-        knots: (K,) by name.
+        knots: (K,) by name; the same for all recordings.
         any_time: whether to add a term that is free in time.
     """
 
@@ -369,11 +369,15 @@ def missing_terms(chains: CutChains, stage: str, base: Fit, known: Sequence[Para
         stage: of the chain.
         base: a fit of the stage.
         known: the parameters of that fit that are refitted along.
-        any_time: add a term that is free in time at each place of the motor.
+        any_time: add a term that is free in time at each place of the motor; of the first recording only, as such a
+            term has nothing in common between recordings.
         torques: makes random torques over inertia (D, N), [rad/s²], of N samples; the share of them that the curves of
             each place would leave is computed.
     """
-    chains = chains.head(MOST_SAMPLES_FREE_IN_TIME if any_time else MOST_SAMPLES)
+    if any_time:
+        chains = chains.head(min(MOST_SAMPLES_FREE_IN_TIME, chains.each[0].signals.train))
+    else:
+        chains = chains.head(MOST_SAMPLES)
     here = [p for p in known if key(p.name).recording < len(chains.each)]
     residuals = chains.residuals(stage)
     search = Search(lambda values: residuals({**base.values, **values}), started(here, base.values))
@@ -386,10 +390,11 @@ def missing_terms(chains: CutChains, stage: str, base: Fit, known: Sequence[Para
     values = [chains.values_of(base.values, k) for k in range(len(chains.each))]
     variables_of, places_of = _OF_STAGE[stage]
     variables = [variables_of(chain, own) for chain, own in zip(chains.each, values, strict=True)]
-    knots = [{name: knots_of(x[:chain.signals.train]) for name, x in v.items()}
-             for v, chain in zip(variables, chains.each, strict=True)]
-    made = [places_of(_Stage(chain, own, v, at, any_time))
-            for chain, own, v, at in zip(chains.each, values, variables, knots, strict=True)]
+    knots = {name: knots_of(np.concatenate([v[name][:chain.signals.train]
+                                            for v, chain in zip(variables, chains.each, strict=True)]))
+             for name in variables[0]}
+    made = [places_of(_Stage(chain, own, v, knots, any_time))
+            for chain, own, v in zip(chains.each, values, variables, strict=True)]
     random = None
     if torques is not None:
         moved = [angle_response(chain, own, torques(len(chain.signals)))
@@ -399,11 +404,8 @@ def missing_terms(chains: CutChains, stage: str, base: Fit, known: Sequence[Para
     found = []
     for place, (curves, _) in made[0].items():
         count = sum(len(c) for *_, c in curves)
-        if any(sum(len(c) for *_, c in own[place][0]) != count for own in made):
-            made = made[:1]
         basis = np.concatenate([-_rows(chains.each[k.recording], k.name, made[k.recording][place][1], count)
-                                if k.recording < len(made) else np.zeros((count, len(search.current[name])))
-                                for name, k in ((name, key(name)) for name in search.weight)], axis=1)
+                                for k in map(key, search.weight)], axis=1)
         size = np.maximum(np.sqrt(np.mean(basis**2, axis=1)), 1e-12)
         rows = np.vstack([jacobian, basis / size[:, None]])
         information = rows @ rows.T + np.diag([*np.ones(len(jacobian)), *np.full(count, STIFF * len(r) / 1e3)])
