@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rig's board as a ROS 2 node, with the topics, services and rate of the simulated plant.
+"""The board of a real rig as a ROS 2 node, with the topics, services and rate of the simulated plant.
 
-Stamps are the instants of sampling, from the board's clock; see `clock` for how it becomes ROS time. After a port was
-opened or the board was reset, no sample is published until that clock has settled (0.4 s). What is missing in between
-is a gap in the stamps, and counted.
+Stamps are the instants of sampling by the board's clock; the module `clock` converts them to ROS time. After the port
+was opened or the board was reset, no sample is published until the clock has settled (0.4 s). The stamps then have a
+gap, which is counted.
 
-The board sets the duty to 0 when it hears nothing for 100 ms. The simulated plant holds the last `duty_command`; so
-that both behave alike, the node repeats the present duty every `REPEAT_S`. It does so from the executor: when the node
-ends, hangs or loses its port, the motor stops. After the port was lost, the board was reset, or the node stood still,
-the duty is 0 until the next command. What was sent while the node stood still is no such command.
+The board sets the duty to 0 if it receives no command for 100 ms. The simulated plant holds the last `duty_command`.
+For the same behaviour, this node repeats the present duty every `REPEAT_S`. The executor repeats it, so the motor stops
+if the node ends, hangs or loses its port. After the port was lost, the board was reset, or the node stood still, the
+duty is 0 until the next command. Commands that were sent while the node stood still do not count.
 
-One thread reads the port and publishes. Commands go out from the executor's callbacks, at once or not at all.
+One thread reads the port and publishes. The callbacks of the executor send commands, at once or not at all.
 """
 
 import math
@@ -37,14 +37,14 @@ from aeropend_sim.ros.usage import usage
 from aeropend_sim.ros.worker import Worker
 
 REPEAT_S = 0.02
-"""Between repetitions of the present duty, s: the board may miss four."""
+"""[s] Time between repetitions of the duty. Derived: the board may miss four within its timeout of 100 ms."""
 RETRY_S = 0.1
-"""Between attempts to open the port, and to get an answer from the board, s."""
+"""[s] Time between attempts to open the port, and between requests to the board. A choice."""
 SILENCE_S = 0.1
-"""Without a sample for this long, the board is not there, s."""
+"""[s] Time without a sample after which the board counts as not connected. A choice."""
 
 ANSWER_S = 0.3
-"""A HELLO that comes later than this after asking was not asked for, s: the board has started anew."""
+"""[s] A HELLO later than this after a request is no answer: the board was reset. A choice."""
 
 SETTINGS = {
     "port": Setting("/dev/ttyACM0", "serial port of the board; better a path in /dev/serial/by-id"),
@@ -104,17 +104,17 @@ class Bridge(RigInterface):
         self._clock_of_board = BoardClock(protocol.TICK_NS, latency_ns)
         self._sequence = 0
         self._settings_sent = self._commanded = 0.0
-        self._deaf_until = -math.inf
+        self._ignore_until = -math.inf
         self._hello: Hello | None = None
         self._asked = -math.inf
-        self._doubted: int | None = None
+        self._other_version: int | None = None
         self._last: Sample | None = None
         self._last_time = 0
         self._heard = -math.inf
         self._counts = Counts()
         self._gap_max = 0.0
         self._stamp = 0
-        self._said = ""
+        self._problem = ""
 
         self.advertise()
         self._diagnostics = Diagnostics(self, self._report, "aeropendulum's board")
@@ -123,14 +123,14 @@ class Bridge(RigInterface):
         self._worker.start()
 
     def close(self) -> None:
-        """Stop the motor and let go of the port."""
+        """Stop the motor and close the port."""
         self._worker.stop()
         if self._hello is not None:
             self.duty = 0.0
             self._command()
         self._link.close()
 
-    # the thread that reads
+    # ---- the thread that reads -------------------------------------------------------------------------------------
 
     def _serve(self, end: threading.Event) -> None:
         prepare_thread()
@@ -141,7 +141,7 @@ class Bridge(RigInterface):
     def _serve_port(self, end: threading.Event) -> None:
         try:
             self._link.open()
-            self._said = ""
+            self._problem = ""
             self._receiver.restart()
             self._converse(end)
         except LinkError as error:
@@ -153,12 +153,12 @@ class Bridge(RigInterface):
             self._counts.reconnects += 1
         self._link.close()
         self._forget_board()
-        if why != self._said:
+        if why != self._problem:
             self.get_logger().warn(f"{why}; trying again every {RETRY_S:g} s")
-            self._said = why
+            self._problem = why
 
     def _forget_board(self) -> None:
-        """The duty is 0 and stays so until the next command."""
+        """Forget the state of the board. The duty is 0 until the next command."""
         with self.lock:
             self._hello, self._last, self.duty = None, None, 0.0
         self._clock_of_board.restart()
@@ -179,7 +179,7 @@ class Bridge(RigInterface):
                 if isinstance(message, Sample):
                     samples.append(message)
                 elif isinstance(message, Hello):
-                    samples.clear()  # from before the reset, or not known yet whose they are
+                    samples.clear()  # from before the reset, or from an unknown board
                     self._greet(message)
                 elif message.status != protocol.Status.OK:
                     self._counts.commands_refused_by_the_board += 1
@@ -192,8 +192,8 @@ class Bridge(RigInterface):
 
     def _greet(self, hello: Hello) -> None:
         if hello.version != protocol.VERSION:
-            if self._doubted != hello.version:  # once more: a disturbed frame must not end the node
-                self._doubted = hello.version
+            if self._other_version != hello.version:  # ask again: a disturbed frame must not end the node
+                self._other_version = hello.version
                 self._ask()
                 return
             raise UserError(
@@ -201,7 +201,7 @@ class Bridge(RigInterface):
                 f" {protocol.VERSION}: flash the firmware that came with it (make -C firmware flash"
                 f" PORT={self._link.port})"
             )
-        self._doubted = None
+        self._other_version = None
         firmware = ".".join(map(str, hello.firmware))
         if self._hello is None:
             self.get_logger().info(f"board at {self._link.port}: firmware {firmware}, build {hello.build:08x}")
@@ -223,7 +223,12 @@ class Bridge(RigInterface):
         self._command()
 
     def _take(self, samples: list[Sample], arrival_ns: int) -> None:
-        """Publish what came with one read; only the last frame's arrival tells something about time."""
+        """Publish the samples of one read.
+
+        Args:
+            samples: in the order of arrival.
+            arrival_ns: [ns] arrival of the last one, host's monotonic clock.
+        """
         clock, counts = self._clock_of_board, self._counts
         for sample in samples:
             board_ns = clock.extend(sample.time)
@@ -261,10 +266,10 @@ class Bridge(RigInterface):
         self.publish_sample(stamp_ns, theta, omega, v_a, i_a, duty)
         self._counts.samples += 1
 
-    # the executor's callbacks
+    # ---- the callbacks of the executor -----------------------------------------------------------------------------
 
     def _command(self) -> None:
-        """Send the present duty."""
+        """Send the present duty to the board."""
         self._commanded = time.monotonic()
         self._sequence = (self._sequence + 1) & 0xFF
         self._link.write(protocol.duty_command(self._sequence, self.duty))
@@ -273,16 +278,16 @@ class Bridge(RigInterface):
         """Send a commanded duty to the board, if there is one and the node did not stand still before."""
         if self._hello is None:
             self._counts.commands_without_board += 1
-        elif self._rests_after_stall():
+        elif self._ignores_commands_after_stall():
             self._counts.commands_of_a_stall += 1
         elif self.enabled:
             self.duty = duty
             self._command()
 
-    def _rests_after_stall(self) -> bool:
-        """Set the duty to 0 when this node stood still, and tell whether a command may be from before.
+    def _ignores_commands_after_stall(self) -> bool:
+        """Set the duty to 0 if this node stood still; return whether a command may be from before.
 
-        The board stopped the motor meanwhile: it must not start again by a command that waited in the middleware.
+        The board has stopped the motor. A command that waited in the middleware must not start it again.
         """
         now = time.monotonic()
         since = now - self._commanded
@@ -290,20 +295,20 @@ class Bridge(RigInterface):
             self._counts.stalls += 1
             self.get_logger().warn(f"stood still for {since:.2f} s: duty 0 until the next command")
             self.duty = 0.0
-            self._deaf_until = now + REPEAT_S
-        return now < self._deaf_until
+            self._ignore_until = now + REPEAT_S
+        return now < self._ignore_until
 
     def _on_repeat(self) -> None:
         with self.lock:
             if self._hello is None:
                 return
-            self._rests_after_stall()
+            self._ignores_commands_after_stall()
             if time.monotonic() - self._commanded > 0.5 * REPEAT_S:
                 self._command()
             if self._last is not None and time.monotonic() - self._settings_sent > RETRY_S:
                 flags = self._last.flags
-                told = bool(flags & Flag.ENABLED), bool(flags & Flag.SSI), bool(flags & Flag.PID)
-                if told != (self.enabled, self._scheme == Scheme.SSI, False):
+                actual = bool(flags & Flag.ENABLED), bool(flags & Flag.SSI), bool(flags & Flag.PID)
+                if actual != (self.enabled, self._scheme == Scheme.SSI, False):
                     self._send_settings()
 
     def enabled_changed(self) -> None:
@@ -331,7 +336,7 @@ class Bridge(RigInterface):
             "cpu share": self.cpu_share.since_last(),
         }
         if not connected:
-            return self._said or f"the board at {self._link.port} says nothing", values
+            return self._problem or f"the board at {self._link.port} sends nothing", values
         return (f"{lost} samples lost" if lost else ""), values
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures what a rig reads at rest and writes the calibration file that the bridge takes.
+"""Measures the readings of a rig at rest, and writes a calibration file for the bridge.
 
-The duty is 0, the arm hangs still, the propeller stands: then angle, current and voltage are 0, and what the board
-reads are their zeros. Scales are not measured; they come from the file named by --base, or are those of nominal parts.
+The duty is 0, the arm hangs still and the propeller stands. Then angle, current and voltage are 0, and the readings of
+the board are their zeros. Scales are not measured; they come from the file of --base, or from the nominal parts.
 """
 
 from __future__ import annotations
@@ -24,33 +24,33 @@ from aeropend_sim.cli.command import EXIT_CODES, Parser, interruptible
 from aeropend_sim.cli.progress import Show, nothing, progress
 
 PATIENCE_S = 5.0
-"""How long the board may take to answer; a Mega's boot loader takes 1 s."""
+"""[s] Time in which the board must answer. A choice: the boot loader of a Mega takes 1 s."""
 SETTLE_S = 0.2
-"""After the scheme was changed: both stages of the angle filter."""
+"""[s] Pause after a change of the scheme, in which both stages of the angle filter settle. A choice."""
 STILL = 2.0
-"""Standard deviation of the angle, counts, above which the arm swings."""
+"""[counts] Standard deviation of the angle above which the arm moves. A choice."""
 SPREAD = 20.0
-"""Standard deviation of current and voltage, counts, above which something is wrong with the wiring."""
+"""[counts] Standard deviation of current and voltage above which the wiring has a fault. A choice."""
 BAD_ANGLES = 0.01
-"""Share of angles with errors from which on the encoder is taken not to be wired that way."""
+"""Share of angles with errors above which the encoder counts as not wired for this scheme. A choice."""
 COUNTS = 1024
 
 EXAMPLES = f"""examples, with the arm hanging still and no bridge running:
   calibrate my_rig.yaml
   calibrate my_rig.yaml --port /dev/ttyACM1 --seconds 10
-  bridge --ros-args --params-file my_rig.yaml      use what was measured
+  bridge --ros-args --params-file my_rig.yaml      use the calibration
 
 {EXIT_CODES}"""
 
 
 class CalibrationError(Exception):
-    """What the user can put right: one line."""
+    """A condition that the user can correct; one line."""
 
 
 def middle(counts: Sequence[int]) -> float:
-    """Return the median of whole numbers, interpolated within its count.
+    """Return the median of integers, interpolated within its count.
 
-    A converter that ends at 0 cuts the noise there; the mean would be too high, the median is not.
+    A converter that ends at 0 cuts the noise there. The mean is then too high, the median is not.
     """
     ordered = sorted(counts)
     median = ordered[len(ordered) // 2]
@@ -61,11 +61,16 @@ def middle(counts: Sequence[int]) -> float:
 
 
 def mean_on_circle(counts: Sequence[int], turn: int = COUNTS) -> tuple[float, float]:
-    """Return mean and standard deviation of positions that wrap at `turn`; the mean is in 0..turn."""
+    """Return mean and standard deviation of positions on a circle.
+
+    Args:
+        counts: the positions.
+        turn: counts of one turn; the mean is in 0..turn.
+    """
     first = counts[0]
-    apart = [(value - first + turn // 2) % turn - turn // 2 for value in counts]
-    mean = sum(apart) / len(apart)
-    return (first + mean) % turn, math.sqrt(sum((value - mean) ** 2 for value in apart) / len(apart))
+    offsets = [(value - first + turn // 2) % turn - turn // 2 for value in counts]
+    mean = sum(offsets) / len(offsets)
+    return (first + mean) % turn, math.sqrt(sum((value - mean) ** 2 for value in offsets) / len(offsets))
 
 
 def _spread(counts: Sequence[int]) -> float:
@@ -77,14 +82,15 @@ def zeros(base: Calibration, pwm: Sequence[Sample], ssi: Sequence[Sample]) -> tu
     """Find the zeros of a rig at rest.
 
     Args:
-        base: supplies every other number.
-        pwm: samples with the encoder read by its PWM output; ssi: by SSI.
+        base: supplies all other values.
+        pwm: samples with the encoder read by its PWM output.
+        ssi: samples with the encoder read by SSI.
 
     Returns:
-        The calibration, and what could not be measured, one line each.
+        The calibration, and one line for each value that could not be measured.
 
     Raises:
-        CalibrationError: the rig is not at rest, or nothing reads the angle.
+        CalibrationError: the rig is not at rest, or the angle cannot be read.
     """
     everything = [*pwm, *ssi]
     if not everything:
@@ -116,7 +122,7 @@ def zeros(base: Calibration, pwm: Sequence[Sample], ssi: Sequence[Sample]) -> tu
 
 
 class _Board:
-    """The board, asked directly."""
+    """The board at a serial port, without a node."""
 
     def __init__(self, port: str) -> None:
         self._link = Link(port, protocol.BAUD)
@@ -130,7 +136,7 @@ class _Board:
         return self._receiver.feed(self._link.read(0.1)[0])
 
     def greet(self) -> Hello:
-        """Ask who it is."""
+        """Request and return its HELLO."""
         end = time.monotonic() + PATIENCE_S
         while time.monotonic() < end:
             self._link.write(protocol.hello_request())
@@ -145,7 +151,14 @@ class _Board:
         raise CalibrationError(f"the board at {self._link.port} does not answer: is the firmware flashed?")
 
     def samples(self, scheme: Scheme, seconds: float, show: Show, done: float) -> list[Sample]:
-        """Collect samples of a scheme, with duty 0; shows the s from `done` on."""
+        """Collect samples of a scheme, with duty 0.
+
+        Args:
+            scheme: how the board reads the encoder.
+            seconds: [s] length.
+            show: shows the progress in s.
+            done: [s] progress at the start.
+        """
         for command in (
             protocol.duty_command(0, 0.0), protocol.enable(False), protocol.set_mode(Mode.DIRECT),
             protocol.set_scheme(scheme),
@@ -169,10 +182,10 @@ def calibrate(port: str, seconds: float, base: Calibration, show: Show = nothing
     """Measure the zeros of the rig at a port.
 
     Args:
-        port: serial port of the board; nobody else may have it.
-        seconds: for each way of reading the encoder.
-        base: supplies every other number.
-        show: is told of the s that are done, of twice `seconds`.
+        port: serial port of the board; no other program may use it.
+        seconds: [s] time for each way of reading the encoder.
+        base: supplies all other values.
+        show: shows the progress in s, up to twice `seconds`.
 
     Returns:
         As `zeros`.

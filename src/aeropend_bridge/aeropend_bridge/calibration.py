@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Raw counts to SI: the numbers of a rig's calibration, and the parameter files that hold them."""
+"""Calibration of a rig: conversion of raw counts to SI units, and the parameter files that hold it."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from aeropend_sim.untrusted import load_yaml, printable
 
 DEFAULT = "motor_shield.yaml"
 SECTION = "calibration"
-"""Where the numbers stand in a parameter file."""
+"""Section of the calibration in a parameter file."""
 _TURN = 2.0 * math.pi
 
 
 class Measured(NamedTuple):
-    """A sample in SI: rad, rad/s, V, A, and the duty 0..1. What was not measured is NaN."""
+    """A sample in SI units: rad, rad/s, V, A, and the duty 0..1. Values that were not measured are NaN."""
 
     theta: float
     omega: float
@@ -35,15 +35,19 @@ class Measured(NamedTuple):
 
 @dataclass(frozen=True)
 class Calibration:
-    """What turns counts into SI.
+    """The calibration of a rig.
 
     Attributes:
-        current_zero: counts without current. current_per_count: A.
-        voltage_zero: counts without voltage. voltage_per_count: V.
-        pwm_zero: counts while the arm hangs, encoder read by its PWM output. pwm_per_count: rad.
-        ssi_zero, ssi_per_count: the same, encoder read by SSI.
-        pulses_per_rev: IR pulses a turn of the rotor.
-        latency: what the line adds to the time from sampling to the arrival of the frame (USB), s.
+        current_zero: [counts] reading without current.
+        current_per_count: [A] scale of the current.
+        voltage_zero: [counts] reading without voltage.
+        voltage_per_count: [V] scale of the voltage.
+        pwm_zero: [counts] reading of the hanging arm, encoder read by its PWM output.
+        pwm_per_count: [rad] scale of the angle, encoder read by its PWM output.
+        ssi_zero: [counts] reading of the hanging arm, encoder read by SSI.
+        ssi_per_count: [rad] scale of the angle, encoder read by SSI.
+        pulses_per_rev: IR pulses per turn of the rotor.
+        latency: [s] smallest delay of a frame by the line (USB), beside its transmission.
     """
 
     current_zero: float
@@ -58,7 +62,7 @@ class Calibration:
     latency: float
 
     def measured(self, raw: Sample) -> Measured:
-        """Turn a sample into SI; an angle that came with an error is NaN."""
+        """Convert a sample to SI units; an angle with an error flag is NaN."""
         if raw.flags & Flag.SSI:
             bad = raw.flags & (Flag.SSI_PARITY | Flag.SSI_STATUS)
             theta = math.nan if bad else (raw.angle - self.ssi_zero) * self.ssi_per_count
@@ -80,7 +84,14 @@ NAMES = tuple(field.name for field in fields(Calibration))
 
 @dataclass(frozen=True)
 class Number:
-    """What a number of the calibration is: unit, range that makes sense, meaning."""
+    """A value of the calibration.
+
+    Attributes:
+        unit: its unit; "-" for none.
+        low: smallest value.
+        high: greatest value.
+        description: its meaning.
+    """
 
     unit: str
     low: float
@@ -90,30 +101,33 @@ class Number:
 
 NUMBERS = {
     "current_zero": Number("counts", -1024.0, 1024.0, "current converter without current"),
-    "current_per_count": Number("A", -1.0, 1.0, "current a count"),
+    "current_per_count": Number("A", -1.0, 1.0, "current per count"),
     "voltage_zero": Number("counts", -512.0, 512.0, "voltage converter without voltage"),
-    "voltage_per_count": Number("V", -1.0, 1.0, "voltage a count"),
+    "voltage_per_count": Number("V", -1.0, 1.0, "voltage per count"),
     "pwm_zero": Number("counts", -1024.0, 1024.0, "encoder's PWM output while the arm hangs"),
-    "pwm_per_count": Number("rad", -0.1, 0.1, "angle a count, encoder's PWM output"),
+    "pwm_per_count": Number("rad", -0.1, 0.1, "angle per count, encoder's PWM output"),
     "ssi_zero": Number("counts", -1024.0, 1024.0, "SSI position while the arm hangs"),
-    "ssi_per_count": Number("rad", -0.1, 0.1, "angle a count, SSI"),
-    "pulses_per_rev": Number("-", 0.01, 1e4, "IR pulses a turn of the rotor"),
-    "latency": Number("s", 0.0, 0.1, "least time that the line, as USB, adds to a frame's arrival"),
+    "ssi_per_count": Number("rad", -0.1, 0.1, "angle per count, SSI"),
+    "pulses_per_rev": Number("-", 0.01, 1e4, "IR pulses per turn of the rotor"),
+    "latency": Number("s", 0.0, 0.1, "smallest delay of a frame by the line, such as USB"),
 }
 
 
 @cache
 def default() -> Calibration:
-    """Return the calibration of the wiring in firmware/README.md, as nominal parts give it."""
+    """Return the calibration of nominal parts, wired as in firmware/README.md."""
     text = (files("aeropend_bridge") / "config" / DEFAULT).read_text(encoding="utf-8")
     return Calibration(**yaml.safe_load(text)["/**"]["ros__parameters"][SECTION])
 
 
 def load(path: str | Path) -> Calibration:
-    """Read the calibration in a ROS 2 parameter file; what it leaves out takes the default.
+    """Read the calibration in a ROS 2 parameter file. Missing values take their defaults.
+
+    Args:
+        path: of the file.
 
     Raises:
-        ValueError: it cannot be read, or a number in it is unusable; one line for a person.
+        ValueError: the file cannot be read, or a value in it cannot be used; one line.
     """
     try:
         tree = load_yaml(Path(path).read_text(encoding="utf-8"))
@@ -130,7 +144,7 @@ def load(path: str | Path) -> Calibration:
         if name not in NUMBERS:
             raise ValueError(f"{path}: unknown number {name!r}; known: {', '.join(NUMBERS)}")
         known = NUMBERS[name]
-        try:  # YAML 1.1 takes 1e-5 for text
+        try:  # 1e-5 is text in YAML 1.1
             given[name] = value = float(value)
         except (TypeError, ValueError, OverflowError):
             raise ValueError(f"{path}: {name} is {value!r}; give a number") from None
@@ -140,21 +154,21 @@ def load(path: str | Path) -> Calibration:
 
 
 def save(calibration: Calibration, path: str | Path, comment: str = "") -> None:
-    """Write a parameter file that the bridge reads; replaces `path` in one step.
+    """Write a parameter file for the bridge; `path` is replaced in one step.
 
     Args:
-        calibration: what to write.
-        path: the file.
-        comment: lines put at the top, each behind `# `.
+        calibration: the calibration.
+        path: of the file.
+        comment: lines at the top of the file; each gets the prefix `# `.
 
     Raises:
-        ValueError: the file cannot be written; what was there before is untouched.
+        ValueError: the file cannot be written. An old file is then unchanged.
     """
     lines = [f"# {printable(line)}" for line in comment.splitlines()]
     lines += ["/**:", "  ros__parameters:", f"    {SECTION}:"]
     for name in NAMES:
         number = repr(float(getattr(calibration, name)))
-        if "e" in number and "." not in number:  # YAML 1.1 would take it for text
+        if "e" in number and "." not in number:  # it would be text in YAML 1.1
             number = number.replace("e", ".0e")
         known = NUMBERS[name]
         lines.append(f"      {name + ': ' + number:<44} # {known.unit}; {known.description}")

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Board time to host time: when a sample was taken, from the board's clock and from when its frames arrived.
+"""Board time to host time, from the arrivals of the frames.
 
-A frame arrives a fixed latency after its sample (conversions, transmission) and then late by whatever USB, kernel and
-scheduler add, which is never negative. So the line that turns board time into host time lies below all arrivals, as
-close as it can: that is an edge of their lower convex hull, the one over the mean board time (Moon, Skelly, Towsley,
-"Estimation and removal of clock skew from network delay measurements", INFOCOM 1999). It needs no threshold for
-outliers: late arrivals, however many and however late, do not move it.
+A frame arrives a fixed latency after its sample (conversions, transmission), plus a delay by USB, kernel and scheduler
+that is never negative. So the line from board time to host time lies below all arrivals and as close to them as
+possible. It is the edge of their lower convex hull over the mean board time (Moon, Skelly, Towsley, "Estimation and
+removal of clock skew from network delay measurements", INFOCOM 1999). No threshold for outliers is needed: late
+arrivals do not move the line.
 
-What is given out does not jump when the line is fitted again: it approaches the new line within `SLEW_S`, at most
-`SLEW` faster or slower than the board's clock, so it always grows. Only when the earliest arrivals of half a second are
-all later than `STOOD_NS`, the board's clock must have stood still (a host that stands still catches up at once): the
-past is forgotten, and what is given out jumps ahead.
+The result does not jump when the line is fitted again. It approaches the new line within `SLEW_S`, at most `SLEW`
+faster or slower than the board's clock, so it always increases. There is one exception: if the earliest arrivals of
+half a second are all later than `STOOD_NS`, the board's clock has stood still (a host that stood still catches up at
+once). Then the past is forgotten, and the result jumps ahead.
 """
 
 from __future__ import annotations
@@ -19,26 +19,30 @@ from collections import deque
 from itertools import pairwise
 
 BUCKET_NS = 100_000_000
-"""Board time of which only the earliest arrival is kept, ns."""
+"""[ns] Board time of a bucket; only its earliest arrival is kept. A choice."""
 BUCKETS = 300
-"""How much of the past is fitted: 30 s."""
+"""Buckets that are fitted: 30 s. A choice."""
 SETTLED = 3
-"""Buckets from which on the line is used."""
+"""Buckets from which on the line is used. A choice."""
 MAX_DRIFT = 0.01
-"""What a board's clock may be off: ceramic resonators are within 0.5 %."""
+"""Greatest relative error of the board's clock. A choice: ceramic resonators are within 0.5 %."""
 STOOD_NS = 10_000_000
+"""[ns] Lateness of all arrivals of a bucket that shows that the board's clock stood still. A choice."""
 STOOD = 5
-"""Buckets in a row that are too late when the board's clock stood still."""
+"""Number of such buckets in a row that are required. A choice."""
 SLEW_S = 0.5
+"""[s] Time in which the result approaches a new line. A choice."""
 SLEW = 0.02
+"""Greatest relative difference between the rate of the result and that of the board's clock. A choice."""
 
 Point = tuple[float, float]
 
 
 class Ticks:
-    """Extends a counter of `bits` bits to one that does not wrap.
+    """Extends a counter to one that does not wrap. Steps of more than half its range count as steps back.
 
-    Steps of more than half its range count as steps back.
+    Args:
+        bits: of the counter.
     """
 
     def __init__(self, bits: int = 32) -> None:
@@ -46,7 +50,7 @@ class Ticks:
         self._last: int | None = None
 
     def extend(self, value: int) -> int:
-        """Return the extended value; the first is taken as it is."""
+        """Return the extended value. The first value stays unchanged."""
         if self._last is None:
             self._last = value
         else:
@@ -87,9 +91,12 @@ class BoardClock:
     """Turns board times into times of the host's monotonic clock.
 
     Args:
-        tick_ns: unit of board times, ns.
-        latency_ns: from the sampling instant to the arrival of its frame when nothing delays it, ns.
+        tick_ns: [ns] unit of board times.
+        latency_ns: [ns] time from the sampling instant to the arrival of its frame without further delay.
         bits: of the board's counter.
+
+    Attributes:
+        stops: number of times that the board's clock stood still.
     """
 
     def __init__(self, tick_ns: int, latency_ns: int = 0, bits: int = 32) -> None:
@@ -98,40 +105,43 @@ class BoardClock:
         self._bits = bits
         self._given = 0
         self.stops = 0
-        """How often the board's clock stood still."""
         self.restart()
 
     def restart(self) -> None:
-        """Forget everything but what was given out: the board was reset, or is another."""
+        """Forget everything except the last result: the board was reset, or replaced."""
         self._ticks = Ticks(self._bits)
         self._origin: tuple[int, int] | None = None  # board and host time of the first arrival, ns
         self._buckets: deque[Point] = deque(maxlen=BUCKETS)
         self._bucket = 0
         self._earliest: Point | None = None
         self._line = (0.0, 0.0)
-        self._slope = self._offset = 0.0  # what is given out: host = board + offset + slope · board
+        self._slope = self._offset = 0.0  # of the result: host = board + offset + slope · board
         self._settled = False
 
     @property
     def settled(self) -> bool:
-        """Whether there have been enough arrivals to fit."""
+        """Whether there were enough arrivals for a fit."""
         return self._settled
 
     @property
     def drift(self) -> float:
-        """How much slower the board's clock runs than the host's, a fraction."""
+        """Relative slowness of the board's clock against that of the host."""
         return self._line[0]
 
     def extend(self, ticks: int) -> int:
-        """Return a board time (ticks as on the wire, in the order they come) without its wraps, ns."""
+        """Return a board time without its wraps, ns.
+
+        Args:
+            ticks: as in the frames, in the order of arrival.
+        """
         return self._ticks.extend(ticks) * self._tick
 
     def add(self, board_ns: int, arrival_ns: int) -> None:
-        """Take the arrival of a frame.
+        """Add the arrival of a frame.
 
         Args:
-            board_ns: its sample's board time, from `extend`.
-            arrival_ns: when it arrived, host's monotonic clock.
+            board_ns: [ns] board time of its sample, from `extend`.
+            arrival_ns: [ns] its arrival, host's monotonic clock.
         """
         if self._origin is None:
             self._origin = board_ns, arrival_ns
@@ -169,14 +179,22 @@ class BoardClock:
         self._slope, self._offset = wanted, given - wanted * now
 
     def early_ns(self, board_ns: int, arrival_ns: int) -> float:
-        """Return by how much an arrival comes before what the fit takes for possible, ns; negative when it is late."""
+        """Return by how much an arrival is earlier than the fit allows, ns; negative for late arrivals.
+
+        Args:
+            board_ns: [ns] board time of the sample, from `extend`.
+            arrival_ns: [ns] arrival of its frame, host's monotonic clock.
+        """
         if self._origin is None:
             return 0.0
         board = board_ns - self._origin[0]
         return board + self._line[1] + self._line[0] * board - (arrival_ns - self._origin[1])
 
     def host_ns(self, board_ns: int) -> int:
-        """Return when a board time was, host's monotonic clock, ns; later than every time given out before.
+        """Convert a board time to the host's monotonic clock, ns. The result is later than all results before.
+
+        Args:
+            board_ns: [ns] board time, from `extend`.
 
         Raises:
             RuntimeError: not settled yet.

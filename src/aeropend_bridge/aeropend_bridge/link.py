@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A serial port that may go away and come back. Reading waits, writing never does."""
+"""A serial port that may disappear and come back. Reading waits, writing does not."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ import serial
 
 
 class LinkError(Exception):
-    """The port cannot be opened, or is gone; the message is one line that says why and what to do."""
+    """The port cannot be opened, or has disappeared. The message is one line with the reason and the remedy."""
 
 
 class Link:
-    """One port.
-
-    One thread opens, reads and closes; any thread may write.
+    """One port. One thread opens, reads and closes; all threads may write.
 
     Args:
-        port: device path, looked up anew at each opening.
-        baud: bits/s.
+        port: path of the device, resolved at each opening.
+        baud: [bit/s] rate.
+
+    Attributes:
+        dropped: number of writes that were dropped because the port was full or closed.
     """
 
     def __init__(self, port: str, baud: int) -> None:
@@ -33,15 +34,14 @@ class Link:
         self._lock = threading.Lock()
         self._torn = False
         self.dropped = 0
-        """Writes that a full or missing port could not take."""
 
     @property
     def is_open(self) -> bool:
-        """Whether there is a port at present."""
+        """Whether the port is open."""
         return self._serial is not None
 
     def open(self) -> None:
-        """Open the port, for this program alone.
+        """Open the port, for this program only.
 
         Raises:
             LinkError: it cannot be opened now.
@@ -73,12 +73,16 @@ class Link:
                 self._serial = None
 
     def read(self, timeout_s: float) -> tuple[bytes, int]:
-        """Wait for bytes and return all there are, and the host's monotonic time at which they were there, ns.
+        """Wait for bytes.
 
-        Returns no bytes after `timeout_s`.
+        Args:
+            timeout_s: [s] longest wait.
+
+        Returns:
+            The bytes, none after `timeout_s`, and the monotonic time of the host at which they were there, ns.
 
         Raises:
-            LinkError: the port is gone.
+            LinkError: the port has disappeared.
         """
         if self._serial is None:
             raise LinkError(f"{self.port} is not open")
@@ -87,7 +91,7 @@ class Link:
             if not select.select([fd], [], [], timeout_s)[0]:
                 return b"", time.monotonic_ns()
             now = time.monotonic_ns()
-            data = os.read(fd, 4096)  # no more than a terminal holds: greater buffers leave holes in the heap
+            data = os.read(fd, 4096)  # the size of a terminal: larger buffers fragment the heap
         except BlockingIOError:
             return b"", time.monotonic_ns()
         except (OSError, ValueError) as error:
@@ -97,16 +101,16 @@ class Link:
         return data, now
 
     def write(self, data: bytes) -> bool:
-        """Write a frame at once or not at all; False when it was dropped."""
+        """Write a frame at once or not at all; return whether it was written."""
         with self._lock:
             if self._serial is None:
                 self.dropped += 1
                 return False
-            if self._torn:  # ends the piece of a frame that went out
+            if self._torn:  # ends the part of a frame that was sent
                 data = b"\0" + data
             try:
                 written = os.write(self._serial.fileno(), data)
-            except (OSError, ValueError):  # full, or gone: then reading says so
+            except (OSError, ValueError):  # full, or disappeared, which reading reports
                 self.dropped += 1
                 return False
             self._torn = written < len(data)

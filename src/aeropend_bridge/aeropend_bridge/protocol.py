@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What board and host say to each other over the wire: frames, messages, and how a stream of bytes is read.
+"""The serial protocol between board and host: frames, messages, and the decoding of a stream of bytes.
 
-A frame is COBS(payload + CRC-16, high byte first) and a zero byte; the CRC is CCITT's with the start value 0xFFFF. The
-payload's first byte is the message's type, numbers are little endian. Board times are u32 ticks of 0.5 µs that wrap
-after 35.8 min. A frame whose CRC is right is still refused when its length does not fit its type or a number is outside
-what the board's converters can give: a flipped bit in a COBS code byte changes several bytes at once, which a CRC of 16
-bits alone lets through once in 65536 times.
+The names are those of firmware/protocol.h; firmware/README.md describes the fields. A frame is COBS(payload + CRC-16,
+high byte first) and a zero byte. The CRC is that of CCITT with the initial value 0xFFFF. The first byte of the payload
+is the type of the message; numbers are little endian. Board times are u32 ticks of 0.5 µs; they wrap after 35.8 min.
+
+A frame with a correct CRC is still refused if its length does not fit its type, or if a value is outside the range of
+the board's converters. The reason: a flipped bit in a COBS code byte changes several bytes at once, and a CRC of 16
+bits accepts one in 65536 of such frames.
 """
 
 from __future__ import annotations
@@ -18,22 +20,23 @@ from typing import NamedTuple
 from cobs import cobs
 
 VERSION = 1
-"""Protocol version that this module speaks."""
+"""Version of the protocol of this module."""
 BAUD = 500_000
+"""[bit/s] Rate of the line."""
 TICK_NS = 500
-"""Unit of board times, ns."""
+"""[ns] Unit of board times."""
 SAMPLE_TICKS = 4080
-"""Board time between samples: 64 · 510 cycles of 62.5 ns."""
+"""[ticks] Board time between samples: 64 · 510 cycles of 62.5 ns."""
 CALIBRATION_SIZE = 16
 """Bytes that the board stores for the host."""
 LONGEST = 64
-"""Bytes between two zeros from which on they are no frame."""
+"""Number of bytes between two zeros from which on they are no frame. A choice: frames have at most 36."""
 COMMAND_TIMEOUT_S = 0.1
-"""Time without a DUTY command after which the board sets the duty to 0."""
+"""[s] Time without a DUTY command after which the board sets the duty to 0."""
 
 
 class Type(IntEnum):
-    """First byte of a payload."""
+    """Type of a message: the first byte of its payload."""
 
     SAMPLE = 0x01
     HELLO = 0x02
@@ -49,25 +52,26 @@ class Type(IntEnum):
 
 
 class Scheme(IntEnum):
-    """How the board reads the encoder: its filtered PWM output by ADC, or its SSI by pins."""
+    """How the board reads the encoder: its filtered PWM output by the ADC, or SSI."""
 
     PWM = 0
     SSI = 1
 
 
 FRAME_NS = {Scheme.PWM: 1_123_000, Scheme.SSI: 1_019_000}
-"""From the sampling instant to the last bit of its frame, ns: conversions, working out, 23 bytes; by the emulator."""
+"""[ns] Time from the sampling instant to the last bit of its frame: conversions, computation, 23 bytes. Measured with
+the emulator."""
 
 
 class Mode(IntEnum):
-    """What sets the duty: the host's commands, or the PID on the board."""
+    """Source of the duty: the commands of the host, or the PID on the board."""
 
     DIRECT = 0
     PID = 1
 
 
 class Status(IntEnum):
-    """What the board answers to a command."""
+    """Answer of the board to a command."""
 
     OK = 0
     BAD_VALUE = 1
@@ -76,7 +80,7 @@ class Status(IntEnum):
 
 
 class Flag(IntFlag):
-    """Bits of a sample's flags."""
+    """Bits of the flags of a sample."""
 
     ENABLED = 1 << 0
     SSI = 1 << 1
@@ -101,9 +105,14 @@ class Sample(NamedTuple):
     """One sample, in raw counts.
 
     Attributes:
-        sequence: 0..255, of frames. time: board time of the sampling instant.
-        duty: output-compare value that acts, 0..255. current: 0..1023. angle: 0..1023.
-        voltage: -512..511. period: ticks of the last turn of the rotor; 0: none. flags: see `Flag`.
+        sequence: number of the frame, 0..255.
+        time: [ticks] board time of the sampling instant.
+        duty: output-compare value that acts, 0..255.
+        current: [counts] 0..1023.
+        angle: [counts] 0..1023.
+        voltage: [counts] -512..511.
+        period: [ticks] duration of the last turn of the rotor; 0: none.
+        flags: see `Flag`.
     """
 
     sequence: int
@@ -117,7 +126,16 @@ class Sample(NamedTuple):
 
 
 class Hello(NamedTuple):
-    """Who the board is. `reset_cause` is MCUSR; `calibration` is what the host stored there."""
+    """Description of the board.
+
+    Attributes:
+        version: of the protocol.
+        firmware: version of the firmware.
+        reset_cause: register MCUSR after the last reset.
+        scheme: how it reads the encoder.
+        calibration: bytes that a host has stored on the board.
+        build: hash of the firmware.
+    """
 
     version: int
     firmware: tuple[int, int, int]
@@ -127,12 +145,17 @@ class Hello(NamedTuple):
     build: int
 
     def why_reset(self) -> str:
-        """Say the reset cause in words."""
+        """The reset cause as text."""
         return " and ".join(text for bit, text in RESET_CAUSES.items() if self.reset_cause >> bit & 1) or "unknown"
 
 
 class Ack(NamedTuple):
-    """The board's answer to a command of type `of`."""
+    """The answer of the board to a command.
+
+    Attributes:
+        of: type of the command.
+        status: see `Status`.
+    """
 
     of: int
     status: int
@@ -151,7 +174,7 @@ def frame(payload: bytes) -> bytes:
 
 
 def unframe(between_zeros: bytes) -> bytes | None:
-    """Return the payload of what stood between two zeros, or None when it is no frame."""
+    """Return the payload of the bytes between two zeros, or None if they are no frame."""
     if not 4 <= len(between_zeros) < LONGEST:
         return None
     try:
@@ -163,7 +186,7 @@ def unframe(between_zeros: bytes) -> bytes | None:
 
 
 def parse(payload: bytes) -> Message | None:
-    """Return the message from the board that a payload holds, or None when it holds none or an impossible one."""
+    """Return the message of a payload from the board, or None if it is no message or has an impossible value."""
     kind, size = payload[0], len(payload)
     if kind == Type.SAMPLE and size == _SAMPLE.size:
         sample = Sample._make(_SAMPLE.unpack(payload)[1:])
@@ -177,7 +200,7 @@ def parse(payload: bytes) -> Message | None:
     if kind == Type.HELLO and size == _HELLO.size:
         _, version, major, minor, patch, cause, scheme, calibration, build = _HELLO.unpack(payload)
         return Hello(version, (major, minor, patch), cause, scheme, calibration, build)
-    if kind == Type.HELLO and size > 1:  # of another version; only the version's place is sure
+    if kind == Type.HELLO and size > 1:  # of another version, of which only the version is known
         return Hello(payload[1], (0, 0, 0), 0, 0, bytes(CALIBRATION_SIZE), 0) if payload[1] != VERSION else None
     if kind == Type.ACK and size == _ACK.size:
         return Ack._make(_ACK.unpack(payload)[1:])
@@ -185,10 +208,10 @@ def parse(payload: bytes) -> Message | None:
 
 
 class Receiver:
-    """Turns a stream of bytes into messages. Holds at most one unfinished frame.
+    """Decodes a stream of bytes into messages. It stores at most one unfinished frame.
 
     Attributes:
-        bad: frames refused so far. What came before the first zero is not counted.
+        bad: number of refused frames. Bytes before the first zero do not count.
     """
 
     def __init__(self) -> None:
@@ -198,12 +221,12 @@ class Receiver:
         self._too_long = False
 
     def restart(self) -> None:
-        """Start over with a stream that was just opened."""
+        """Start with a stream that was just opened."""
         self._rest = b""
         self._synchronised = self._too_long = False
 
     def feed(self, data: bytes) -> list[Message]:
-        """Take bytes as they come and return the messages they complete."""
+        """Add bytes, and return the messages that they complete."""
         pieces = (self._rest + data).split(b"\0")
         self._rest = pieces.pop()
         messages: list[Message] = []
@@ -224,17 +247,22 @@ class Receiver:
 
 
 def duty_command(sequence: int, duty: float) -> bytes:
-    """Frame of DUTY: `sequence` 0..255, `duty` 0..1. Not acknowledged."""
+    """Frame of DUTY. The board does not acknowledge it.
+
+    Args:
+        sequence: 0..255.
+        duty: 0..1.
+    """
     return frame(struct.pack("<BBH", Type.DUTY, sequence, round(duty * 65535)))
 
 
 def hello_request() -> bytes:
-    """Frame that asks the board for HELLO."""
+    """Frame of HELLO_REQUEST; the board answers with HELLO."""
     return frame(bytes([Type.HELLO_REQUEST]))
 
 
 def enable(on: bool) -> bytes:
-    """Frame of ENABLE; off means duty 0."""
+    """Frame of ENABLE; False means duty 0."""
     return frame(bytes([Type.ENABLE, on]))
 
 
@@ -249,17 +277,33 @@ def set_mode(mode: Mode) -> bytes:
 
 
 def pid_gains(kp: float, ki: float, kd: float, filter_s: float, low: float, high: float) -> bytes:
-    """Frame of PID_GAINS: gains (duty/rad, duty/(rad·s), duty·s/rad), derivative filter (s), limits of the duty."""
+    """Frame of PID_GAINS.
+
+    Args:
+        kp: [1/rad] proportional gain, duty per angle.
+        ki: [1/(rad·s)] integral gain.
+        kd: [s/rad] derivative gain.
+        filter_s: [s] time constant of the derivative filter.
+        low: smallest duty.
+        high: greatest duty.
+    """
     return frame(struct.pack("<B6f", Type.PID_GAINS, kp, ki, kd, filter_s, low, high))
 
 
 def pid_reference(theta: float) -> bytes:
-    """Frame of PID_REFERENCE, rad."""
+    """Frame of PID_REFERENCE.
+
+    Args:
+        theta: [rad] reference of the angle, as the encoder reads it.
+    """
     return frame(struct.pack("<Bf", Type.PID_REFERENCE, theta))
 
 
 def write_calibration(block: bytes) -> bytes:
     """Frame of WRITE_CALIBRATION.
+
+    Args:
+        block: bytes to store on the board.
 
     Raises:
         ValueError: the block is not `CALIBRATION_SIZE` bytes.

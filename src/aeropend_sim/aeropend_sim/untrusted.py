@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What comes from strangers: text that is shown to a person, and YAML without what can hurt.
+"""Input from files of unknown origin: text made printable, and YAML read without harm.
 
-A file may be anybody's. PyYAML's safe loaders run no code, but nesting overflows the C stack, merged aliases multiply,
-long numbers take hours, and a tag that does not fit its value raises whatever the value's type raises.
+The safe loaders of PyYAML run no code. But deep nesting overflows the C stack, merged aliases grow without limit, the
+conversion of a long number takes hours, and a tag that does not fit its value raises an exception of any type.
 """
 
 from __future__ import annotations
@@ -12,30 +12,33 @@ from typing import Any
 import yaml
 
 DEEPEST = 50
-"""Mappings and lists inside each other; parameter files and bags' metadata have fewer than 10."""
+"""Greatest depth of mappings and lists. A choice: parameter files and metadata of bags have fewer than 10."""
 LONGEST_MESSAGE = 2000
-"""Characters of what is said in one line."""
+"""Greatest number of characters of a message. A choice."""
 LONGEST_WORD = 1000
-"""Characters of an unquoted word, which may be a number."""
+"""Greatest number of characters of an unquoted word, which may be a number. A choice."""
 
 _FASTEST: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def printable(text: str) -> str:
-    r"""The same text with what steers a terminal, breaks a line or cannot be encoded as \x1b, \n, \udcff."""
+    r"""The text with control characters, line breaks and lone surrogates written as \x1b, \n, \udcff."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def one_line(text: str) -> str:
-    """The same text as one line for a person: printable and not endless."""
+    """The text as one printable line of limited length."""
     return printable(text if len(text) <= LONGEST_MESSAGE else f"{text[:LONGEST_MESSAGE]} …")
 
 
 def check_yaml(text: str | bytes) -> None:
-    """Make sure that YAML can be read without harm, in a time and memory in proportion to its length.
+    """Check that YAML can be read in a time and memory proportional to its length.
+
+    Args:
+        text: one document.
 
     Raises:
-        yaml.YAMLError: it is none, holds an alias, is nested deeper than `DEEPEST`, or holds an endless word.
+        yaml.YAMLError: it is no YAML, has an alias, is nested deeper than `DEEPEST`, or has a word that is too long.
     """
     depth = 0
     event: Any
@@ -61,7 +64,7 @@ def load_yaml(text: str | bytes, loader: Any = _FASTEST) -> Any:
 
     Args:
         text: one document.
-        loader: a safe one.
+        loader: a safe loader of PyYAML.
 
     Raises:
         yaml.YAMLError: it cannot be read.
@@ -71,5 +74,5 @@ def load_yaml(text: str | bytes, loader: Any = _FASTEST) -> Any:
         return yaml.load(text, loader)
     except yaml.YAMLError:
         raise
-    except Exception as error:  # what int(), float() and datetime() raise
+    except Exception as error:  # from int(), float() and datetime()
         raise yaml.YAMLError(f"a value does not fit its tag or type: {error}") from error

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every command stands on: arguments, completion, progress."""
+"""The parts that all commands share: arguments, completion, progress."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all commands share: usage errors in one line, exit codes, and completion by the shell.
+"""The command line of all commands: usage errors in one line, exit codes, completion by the shell.
 
 A shell asks for completions by running the command with `_ARGCOMPLETE` set (argcomplete's protocol); see `completion`.
 """
@@ -20,14 +20,15 @@ Completer = Callable[..., Iterable[str]]
 
 
 def asked_to_complete() -> bool:
-    """Whether it is a shell that runs this program, to learn what may come next on the command line."""
+    """Whether a shell runs this program to get completions."""
     return "_ARGCOMPLETE" in os.environ
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong with a command line in one line, and completes what begins well.
+    """A parser that reports an error of the command line in one line, and gives completions to the shell.
 
-    What is offered for an argument are its choices, or, by its metavar: BAG, DIR, FILE, OUT and PRESET|FILE.
+    The completions of an argument are its choices. Without choices its metavar decides: BAG, DIR, FILE, OUT or
+    PRESET|FILE.
     """
 
     def error(self, message: str) -> NoReturn:
@@ -37,13 +38,18 @@ class Parser(argparse.ArgumentParser):
     def parse_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> argparse.Namespace:
-        """Read a command line, but for what is ROS's; exits with 2 and one line where it is wrong."""
+        """Read a command line without its ROS arguments; on an error, exit with code 2 and one line.
+
+        Args:
+            args: the arguments; None for those of the process.
+            namespace: takes the values.
+        """
         if asked_to_complete():
             self.complete()
         return super().parse_args(own(args), namespace)
 
     def complete(self) -> None:
-        """Tell the shell what may come next, and end."""
+        """Print the completions for the shell, and exit."""
         from argcomplete import autocomplete
 
         for action in self._actions:
@@ -54,13 +60,24 @@ class Parser(argparse.ArgumentParser):
 
 
 def own(arguments: Sequence[str] | None) -> list[str]:
-    """A command line (default: the process's) without the ROS arguments that `ros2 run` may pass on."""
+    """A command line without the ROS arguments that `ros2 run` may add.
+
+    Args:
+        arguments: the command line; None for that of the process.
+    """
     given = list(sys.argv[1:] if arguments is None else arguments)
     return given[: given.index("--ros-args")] if "--ros-args" in given else given
 
 
 def between(low: float, high: float, what: str, unit: str = "") -> Callable[[str], float]:
-    """A type of argument: a number of a range. `what` names it, as in "a share"."""
+    """The type of an argument that is a number in a range.
+
+    Args:
+        low: smallest value.
+        high: greatest value.
+        what: name for the error message, with its article, as in "a share".
+        unit: unit of the range.
+    """
 
     def read(text: str) -> float:
         try:
@@ -79,7 +96,7 @@ P = ParamSpec("P")
 
 
 def interruptible(main: Callable[P, int]) -> Callable[P, int]:
-    """Let an entry point end with one line and code 130 on Ctrl-C, and in silence when nobody reads it any more."""
+    """Make an entry point end with one line and code 130 on Ctrl-C, and silently if its output is closed."""
 
     @wraps(main)
     def interruptible_main(*args: P.args, **kwargs: P.kwargs) -> int:
@@ -91,14 +108,14 @@ def interruptible(main: Callable[P, int]) -> Callable[P, int]:
             print(f"{Path(sys.argv[0]).stem}: interrupted", file=sys.stderr)
             return 130
         except BrokenPipeError:  # as in `identify my_bag | head -1`
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left has somewhere to go
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the rest of the output goes there
             return 128 + signal.SIGPIPE
 
     return interruptible_main
 
 
 def files(prefix: str, **_: Any) -> Iterable[str]:
-    """Paths that begin like this."""
+    """The paths that start with a prefix."""
     from argcomplete.completers import FilesCompleter
 
     return FilesCompleter()(prefix)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Completion of every command with TAB, in bash and zsh: `eval "$(python -m aeropend_sim.cli.completion)"`."""
+"""Completion of all commands with TAB, in bash and zsh: `eval "$(python -m aeropend_sim.cli.completion)"`."""
 
 from importlib.metadata import EntryPoint, entry_points
 
@@ -11,7 +11,7 @@ def commands() -> list[EntryPoint]:
 
 
 def main() -> None:
-    """Print what the shell is to run."""
+    """Print the code for the shell to evaluate."""
     from argcomplete.shell_integration import shellcode
 
     print(shellcode([command.name for command in commands()], use_defaults=False))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far a command is, and how long it will still take."""
+"""Progress of a command, and the time that is left."""
 
 import threading
 from collections.abc import Iterator
@@ -11,24 +11,29 @@ from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.text import Text
 
 SILENT_S = 2.0
-"""Work before a bar is shown, s: what takes less needs none."""
+"""[s] Time before a progress bar is shown. A choice: shorter work needs no bar."""
 
 
 class Show(Protocol):
-    """Shows how much is done."""
+    """Shows the progress."""
 
     def __call__(self, done: float, what: str = "") -> None:
-        """Show that this much of the total is done; `what` is done now, if that has changed."""
+        """Show the progress.
+
+        Args:
+            done: finished part of the total.
+            what: new description of the work; "" if it is the same.
+        """
 
 
 class TimeLeft(ProgressColumn):
-    """The time left when it goes on as it did, from the first step on: rich's own column waits for more of them."""
+    """The time left, from the mean speed so far. It is shown after the first step; that of rich needs more steps."""
 
     def render(self, task: Task) -> Text:
-        """Its text."""
+        """Text of the column."""
         if not task.completed or task.total is None or task.elapsed is None:
             return Text("")
-        at: float = task.fields["at"]  # when the last step was done
+        at: float = task.fields["at"]  # time of the last step
         left = at * (task.total - task.completed) / task.completed - (task.elapsed - at)
         minutes, seconds = divmod(max(0, round(left)), 60)
         return Text(f"{minutes} min {seconds:02} s left" if minutes else f"{seconds} s left")
@@ -41,13 +46,13 @@ def nothing(done: float, what: str = "") -> None:
 @contextmanager
 def progress(what: str, total: float = 1.0, console: Console | None = None, silent_s: float = SILENT_S
              ) -> Iterator[Show]:
-    """A bar with the time left on standard error, where that is a terminal and the work has taken a while.
+    """Show a bar with the time left on standard error, if that is a terminal and the work takes long.
 
     Args:
-        what: is done.
-        total: what `done` counts up to.
-        console: another place for it.
-        silent_s: work before it is shown, s.
+        what: description of the work.
+        total: value of `done` at the end.
+        console: other place for the bar.
+        silent_s: [s] time before the bar is shown.
     """
     console = console or Console(stderr=True)
     bar = Progress(TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"),

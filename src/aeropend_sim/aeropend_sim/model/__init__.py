@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The model that everybody shares: parameters, effects, equations of motion, measurement chain."""
+"""The model that all packages share: parameters, effects, equations of motion, measurement chain."""

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Duty to voltage to speed to thrust in steady state, and the inverses that the controllers use.
+"""Duty to voltage to speed to thrust in steady state, and the inverse functions for the controllers.
 
-All functions take and return scalars or arrays of one shape, SI units, duty 0..1.
+All functions take and return scalars or arrays of one shape, in SI units. A duty is a fraction 0..1. `numbers` are the
+parameters of the model by name, from `Model.numbers`.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ def voltage(numbers: Numbers, duty: ArrayLike) -> Array:
 
 
 def duty(numbers: Numbers, voltage: ArrayLike) -> Array:
-    """Duty that gives a voltage (V), clipped to 0..1; at 0 V and below the duty is 0 (the map's dead zone)."""
+    """Duty that gives a voltage (V), clipped to 0..1. At 0 V and below it is 0, the dead zone of the map."""
     v = np.asarray(voltage, dtype=float)
     root = np.maximum(0.0, (v - numbers["k0"]) / numbers["k1"])
     return np.where(v <= 0.0, 0.0, np.minimum(np.maximum((root * root - numbers["k3"]) / numbers["k2"], 0.0), 1.0))
@@ -66,7 +67,7 @@ def speed_at(numbers: Numbers, voltage: ArrayLike) -> Array:
 
 def voltages(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, float]],
              period: float, start: int = 0, before: float = 0.0) -> tuple[Array, Array]:
-    """`acting_voltage` and `sampled_voltage`, worked out together."""
+    """`acting_voltage` and `sampled_voltage` together, with the arguments of `acting_voltage`."""
     first, then, part = _over_hold(numbers, duty, effects, period, start, before)
     if part == 0.0:
         return then, first
@@ -79,32 +80,32 @@ def acting_voltage(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[
                    period: float, start: int = 0, before: float = 0.0) -> Array:
     """Voltage at the bridge over each hold of a duty series, with the effects that need no state.
 
-    A voltage that changes within a hold, because a delay is not a whole number of periods, is replaced by the constant
-    one that drives the winding to the same current. `supply_sag` needs the current and is in `dynamics`.
+    If a delay is not a whole number of periods, the voltage changes within a hold. The result is then the constant
+    voltage that drives the winding to the same current. `supply_sag` needs the current; see `terminal_voltage`.
 
     Args:
-        numbers: the model's numbers.
+        numbers: parameters of the model.
         duty: (N,) duty held over [t_k, t_{k+1}).
         effects: the active effects.
-        period: s.
-        start: index of the first sample since the supply was fresh.
+        period: [s] time between samples.
+        start: index of the first sample, counted from the start of `supply_drift`.
         before: duty that acted before the first sample.
 
     Returns:
-        (N,) V.
+        (N,) [V] voltage.
     """
     return voltages(numbers, duty, effects, period, start, before)[0]
 
 
 def sampled_voltage(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, float]],
                     period: float, start: int = 0, before: float = 0.0) -> Array:
-    """As `acting_voltage`, at the instant of each sample, when each hold begins."""
+    """As `acting_voltage`, at the instant of each sample, at which the hold starts."""
     return _over_hold(numbers, duty, effects, period, start, before)[0]
 
 
 def _over_hold(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, float]], period: float, start: int,
                before: float) -> tuple[Array, Array, float]:
-    """Voltage (N,) at the beginning of each hold, voltage after a delayed change in it, and when in it that comes."""
+    """Voltage (N,) at the start of each hold, voltage (N,) after a delayed change, and share of the hold before it."""
     n = len(duty)
 
     def at_bridge(v: Array) -> Array:
@@ -121,7 +122,7 @@ def _over_hold(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str,
     if whole == 0 and part == 0.0:
         v = at_bridge(voltage(numbers, duty))
         return v, v, 0.0
-    # a duty that acts early is foreseen as far as the series goes, and taken to stay after its end
+    # a negative delay takes later duties of the series; after its end the last duty stays
     late = voltage(numbers, np.concatenate([np.full(max(whole + 1, 0), before), duty, duty[n - max(-whole, 0):]]))
     then = at_bridge(late[1:n + 1])
     return (at_bridge(late[:n]) if part > 0.0 else then), then, part
@@ -145,7 +146,7 @@ def terminal_voltage(model: Model, voltage: ScalarOrArray, current: ScalarOrArra
 
 
 def static_angle(numbers: Numbers, duty: ArrayLike) -> Array:
-    """Angle (rad) at which a duty holds the arm; NaN where the thrust exceeds the arm's weight."""
+    """Angle (rad) at which a duty holds the arm; NaN if the thrust exceeds the weight of the arm."""
     f = thrust(numbers, speed_at(numbers, voltage(numbers, duty)))
     with np.errstate(invalid="ignore"):
         return np.arcsin(numbers["L_over_J"] * f / numbers["mgd_over_J"])

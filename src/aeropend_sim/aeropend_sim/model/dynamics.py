@@ -2,13 +2,15 @@
 """The equations of the plant, once: nominal and with every effect, for one hold of the input at a time.
 
 The chain is advanced in the direction of cause: winding and rotor (which act on each other), air, arm. Winding, rotor
-and air are first-order lags, advanced exactly for an input that is quadratic over the hold (exponential time
-differencing, Cox & Matthews 2002); the arm by the fourth-order Runge-Kutta-Nyström method. So a hold as long as the
-electrical time constant costs no accuracy. A longer hold, or that of a faster plant, is cut into equal steps.
+and air are first-order lags. They are advanced exactly for an input that is quadratic over the step (exponential time
+differencing, Cox & Matthews 2002). The arm is advanced by the fourth-order Runge-Kutta-Nyström method. So a step as
+long as the electrical time constant costs no accuracy. A longer hold, or the hold of a faster plant, is cut into equal
+steps.
 
-`Values` of effects are passed as None for the nominal model: numba then compiles the equations without them.
+For the nominal model the effects are None: numba then compiles the equations without them.
 
-Source of the nominal equations: thesis (3.2) to (3.5), with the quadratic load of FACTS.
+Source of the nominal equations: thesis (3.2) to (3.5), with a quadratic load of the propeller (see `k_load` in
+docs/interfaces.md). Equations of the effects: docs/effects.md.
 """
 
 from __future__ import annotations
@@ -27,29 +29,29 @@ from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 Array = NDArray[np.float64]
 
 equation = njit(forceinline=True, error_model="numpy")
-"""Compiles one equation into whatever calls it, without a test for zero before each division."""
+"""Decorator of an equation: it is compiled into its callers, without a test for zero before each division."""
 
 THRUST_PIVOT_SPEED = 150.0
-"""rad/s at which `thrust_exponent` leaves the thrust as it is (contract section 4)."""
+"""[rad/s] Speed at which `thrust_exponent` does not change the thrust (docs/effects.md). Convention."""
 
 NO_LAG = 1e-6
-"""A lag shorter than this share of a step is none."""
+"""Share of a step below which the time constant of a lag counts as zero. A choice."""
 
 ROUND = 6755399441055744.0
-"""1.5 · 2^52: added and taken off again, it rounds to the nearest integer."""
+"""1.5 · 2^52: adding and subtracting it rounds a double to the nearest integer."""
 
 BRUSH_CURRENT = 0.02
-"""A over which the brush drop turns from one sign to the other (contract section 4)."""
+"""[A] Scale of the current over which the brush drop changes its sign (docs/effects.md). Convention."""
 
 LONGEST_STEP = 2.5e-3
-"""s: one step over a longer hold would miss more than 2e-5 of the range of `bench`."""
+"""[s] Longest step. Measured: over a longer one the error exceeds 2e-5 of the range of each state of `bench`."""
 
 MOST_STEPS = 1000
-"""Steps that a hold is cut into at most, however fast the numbers say that the plant is."""
+"""Greatest number of steps of a hold, also for the fastest plant. A choice."""
 
 
 class Lag(NamedTuple):
-    """Weights of a first-order lag ẋ = -a x + g over a hold of h, for g quadratic through its values at 0, h/2, h.
+    """Weights of a first-order lag ẋ = -a x + g over a step h, for g quadratic through its values at 0, h/2, h.
 
     x(h) = decay x + w0 g0 + w1 g(h/2) + w2 g(h), and x(h/2) likewise with half_decay, u0, u1, u2.
     """
@@ -66,7 +68,12 @@ class Lag(NamedTuple):
 
 @equation
 def lag(a: float, h: float) -> Lag:
-    """The weights for rate a (1/s, >= 0) and hold h (s)."""
+    """The weights of a lag.
+
+    Args:
+        a: [1/s] rate, >= 0.
+        h: [s] length of the step.
+    """
     half = math.exp(-0.5 * a * h)
     full = half * half
     p1, p2, p3 = _phi(full, -a * h)
@@ -93,7 +100,7 @@ def _phi(exp_z: float, z: float) -> tuple[float, float, float]:
 
 
 class Coefficients(NamedTuple):
-    """What the equations need of a model for one length of hold, precomputed by `prepare`: `steps` steps of `h` s."""
+    """Coefficients of the equations for one length of hold: `steps` steps of `h` seconds. `prepare` computes them."""
 
     steps: int
     h: float
@@ -111,7 +118,7 @@ class Coefficients(NamedTuple):
 
 
 class Extra(NamedTuple):
-    """As `Coefficients`, for the effects: the weights that depend on their parameters."""
+    """Coefficients of the effects for one length of hold."""
 
     cooling: Lag
     air: Lag
@@ -125,7 +132,7 @@ class Extra(NamedTuple):
 
 
 class State(NamedTuple):
-    """State of the plant at an instant, SI. The last four belong to effects and stay 0 without them."""
+    """State of the plant at an instant, SI units. The last four belong to effects and are 0 without them."""
 
     i_a: float = 0.0
     omega: float = 0.0
@@ -158,7 +165,7 @@ class Motion(NamedTuple):
 
 @equation
 def sine_cosine(x: float) -> tuple[float, float]:
-    """(sin x, cos x) to 1e-15 within some turns, without a branch or a call: many models then advance in SIMD lanes."""
+    """(sin x, cos x) to 1e-15 within a few turns, without branch or call, so that it runs in SIMD lanes."""
     k = (x * (1.0 / math.pi) + ROUND) - ROUND
     r = x - k * math.pi
     z = r * r
@@ -376,7 +383,7 @@ def static_thrust(w: float, c: Coefficients, e: Values | None) -> float:
 
 @equation
 def static_thrust_near(w: float, w0: float, f0: float, c: Coefficients, e: Values | None) -> float:
-    """As `static_thrust`, given f0 of a speed w0: if that is close, by the binomial series, which costs less."""
+    """As `static_thrust`. Near a speed w0 of known thrust f0 it uses the binomial series, which is faster."""
     if e is None or e.thrust_exponent_n == 2.0 or abs(w - w0) >= 0.05 * abs(w0):
         return static_thrust(w, c, e)
     n, d = e.thrust_exponent_n, w / w0 - 1.0
@@ -410,7 +417,7 @@ def arm_drive(sin_theta: float, motion: Motion, f: float, w: float, gust: float,
 
 @equation
 def near_ground(theta: float, e: Values | None) -> float:
-    """Share by which the ground effect raises the thrust: gain exp(-|θ|/width)."""
+    """Relative rise of the thrust by the ground effect: gain exp(-|θ|/width)."""
     if e is None or e.ground_effect_gain == 0.0:
         return 0.0
     return e.ground_effect_gain * math.exp(-abs(theta) / e.ground_effect_width)
@@ -418,7 +425,7 @@ def near_ground(theta: float, e: Values | None) -> float:
 
 @equation
 def nearer_ground(g: float, theta: float, moved: float, e: Values | None, x: Extra | None) -> float:
-    """`near_ground` of an angle that has moved a little from theta, where it is g."""
+    """`near_ground` of an angle `moved` that is close to `theta`, where its value is g."""
     if e is None or e.ground_effect_gain == 0.0:
         return 0.0
     return g + g * ((abs(theta) - abs(moved)) * x.per_width)
@@ -426,7 +433,7 @@ def nearer_ground(g: float, theta: float, moved: float, e: Values | None, x: Ext
 
 @equation
 def flex_restoring(flex: float, flex_dot: float, e: Values) -> float:
-    """What pulls the mast back: 2 zeta omega q̇ + omega² q."""
+    """Restoring acceleration of the mast: 2 zeta omega q̇ + omega² q."""
     if e.mast_flex_coupling == 0.0:
         return 0.0
     return 2.0 * e.mast_flex_zeta * e.mast_flex_omega * flex_dot + e.mast_flex_omega**2 * flex
@@ -636,7 +643,12 @@ def advance(state: State, v: float, c: Coefficients, e: Values | None, x: Extra 
 
 
 def steady(model: Model, duty: float) -> State:
-    """The state in which a duty holds the nominal plant; the arm at rest below where the thrust exceeds its weight."""
+    """Steady state of the nominal plant for a duty; the arm hangs if the thrust exceeds its weight.
+
+    Args:
+        model: its effects are ignored, except `parameter_mismatch`.
+        duty: 0..1.
+    """
     n = model.numbers()
     omega = float(actuator.speed_at(n, actuator.voltage(n, duty)))
     theta = float(actuator.static_angle(n, duty))
@@ -645,7 +657,15 @@ def steady(model: Model, duty: float) -> State:
 
 
 def steps_in(model: Model, period: float) -> int:
-    """Into how many steps a hold of `period` s must be cut: 1 at the rig's period unless the plant is much faster."""
+    """Number of steps of a hold: 1 at the rig's period, unless the plant is much faster than `bench`.
+
+    The rates below are those of the fastest motions. The factors (0.04, 0.02, 0.1, 0.3) are choices; the tests compare
+    the result with scipy's integrators for fast plants.
+
+    Args:
+        model: numbers and effects.
+        period: [s] length of the hold.
+    """
     n, e = model.numbers(), values(model.effects)
     top_speed = (abs(n["k0"]) + n["k1"] * math.sqrt(n["k2"] + n["k3"])) / n["K_e"]  # rad/s, never reached
     back = n["K_t"] * n["K_e"] / (n["J_m"] * n["L_a"])  # 1/s²: the speed acts back on itself through the winding
@@ -668,7 +688,16 @@ def steps_in(model: Model, period: float) -> int:
 
 def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0
             ) -> tuple[Coefficients, Values | None, Extra | None]:
-    """What `run` needs of a model for holds of `period` seconds, cut into `steps` (0: as many as it takes)."""
+    """Coefficients of a model for `run`, `run_arm` and `run_motor`.
+
+    Args:
+        model: numbers and effects.
+        period: [s] length of a hold.
+        steps: steps of a hold; 0: `steps_in` decides.
+
+    Returns:
+        The coefficients, the effects, and the coefficients of the effects. The last two are None without effects.
+    """
     n = model.numbers()
     e = values(model.effects)
     steps = steps or steps_in(model, period)
@@ -687,9 +716,10 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0
 
 
 class Trajectory(NamedTuple):
-    """States at the samples, each (N,), SI; `v_a` is the voltage at the motor's terminals as the hold begins.
+    """States at the samples, each (N,), SI units.
 
-    `thrust` is the air's, before `ground_effect` and `axial_inflow`.
+    `v_a` is the voltage at the motor's terminals at the start of the hold. `thrust` is the thrust before the
+    effects `ground_effect` and `axial_inflow`.
     """
 
     theta: Array
@@ -827,10 +857,10 @@ def simulate(model: Model, duty: Array, period: float = SAMPLE_PERIOD, state: St
     Args:
         model: numbers and effects.
         duty: (N,) 0..1.
-        period: s.
+        period: [s] time between samples.
         state: at the first sample; at rest by default.
-        noise: (N,) standard normal numbers for `gust`; none: no gust.
-        start: index of the first sample since the supply was fresh (for `supply_drift`).
+        noise: (N,) standard normal numbers for `gust`; None: no gust.
+        start: index of the first sample, counted from the start of `supply_drift`.
 
     Returns:
         Trajectory of (N,) arrays at the N sample instants.

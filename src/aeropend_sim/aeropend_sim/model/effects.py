@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The catalogue of effects that a nominal model can miss: one entry an effect.
+"""The catalogue of effects that a nominal model can lack: one entry per effect.
 
 To add one: an entry here, its term in `actuator.py`, `dynamics.py` or `sensing.py`, and its row in docs/effects.md.
 """
@@ -9,18 +9,27 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 PLACES = ("actuator", "electrical", "rotor", "thrust", "arm", "sensing")
-"""The chain from the duty to the reading, in the direction of cause."""
+"""The places of the chain from the duty to the reading, in the direction of cause."""
 
 PARAMETER_MISMATCH = "parameter_mismatch"
-"""The effect whose parameters are the model's own numbers, by their model-file names, and their new values."""
+"""The effect that replaces parameters of the model: their names in the model file, and their new values."""
 
 
 @dataclass(frozen=True)
 class EffectParameter:
-    """One number of an effect: at `neutral` the effect is absent; `default` is a size worth finding on `bench`."""
+    """One parameter of an effect.
+
+    Attributes:
+        unit: its unit; "-" for none.
+        neutral: value at which the effect is absent.
+        default: value that an effect without this parameter takes; of a size that matters on `bench`.
+        low: smallest value.
+        high: greatest value.
+        description: its meaning.
+    """
 
     unit: str
     neutral: float
@@ -32,9 +41,9 @@ class EffectParameter:
 
 @dataclass(frozen=True)
 class Effect:
-    """An effect: where in the chain it lives, its physics in one line, and its parameters.
+    """An effect: its place in the chain, its physics in one line, and its parameters.
 
-    The first parameter is the size: at its neutral value the effect is absent whatever the others are.
+    The first parameter is the size: at its neutral value the effect is absent, whatever the values of the others.
     """
 
     id: str
@@ -42,16 +51,16 @@ class Effect:
     physics: str
     parameters: dict[str, EffectParameter]
     in_equations: bool = True
-    """Whether `dynamics` holds its term, or only `actuator` or `sensing`, which shape the input and the reading."""
-    linear_in: str = ""
-    """What of its first two parameters acts linearly, if not the size alone.
+    """Whether its term is in `dynamics`; otherwise it is in `actuator` (input) or `sensing` (reading)."""
+    linear_in: Literal["", "product", "polar"] = ""
+    """How the effect depends on its first two parameters, if it is not linear in the size alone.
 
     `product`: the size, and the size times the second; `polar`: the size times the cosine and the sine of the second.
     """
 
     @property
     def size(self) -> str:
-        """Name of the parameter that measures how large the effect is."""
+        """Name of the parameter that is the size of the effect."""
         return next(iter(self.parameters))
 
 
@@ -115,29 +124,37 @@ _ENTRIES = (
 )
 
 CATALOGUE: dict[str, Effect] = {entry.id: entry for entry in _ENTRIES}
-"""Every effect but `parameter_mismatch`, by id, in the order of the chain."""
+"""All effects except `parameter_mismatch`, by id, in the order of the chain."""
 
 SPIKE_FACTOR = (1.3, 4.0)
-"""A false capture period is too short: the speed read is this many times the true one, uniform between the two."""
+"""Range of the false speed over the true one, uniform: a false capture period is too short. Convention."""
 
 _FIELDS = {f"{effect.id}_{name}": parameter.neutral
            for effect in _ENTRIES if effect.in_equations for name, parameter in effect.parameters.items()}
 
 Values = NamedTuple("Values", [(name, float) for name in _FIELDS])  # type: ignore[misc]
-"""Every parameter of every effect in the equations as `<id>_<parameter>`: what `dynamics` reads."""
+"""All parameters of the effects in the equations, as `<id>_<parameter>`, for `dynamics`."""
 
 
 def is_active(effect_id: str, parameters: Mapping[str, float]) -> bool:
-    """Whether an effect with these parameters differs from the nominal model."""
+    """Whether an effect with these parameters differs from the nominal model.
+
+    Args:
+        effect_id: its id.
+        parameters: all of its parameters by name.
+    """
     effect = CATALOGUE[effect_id]
     return parameters[effect.size] != effect.parameters[effect.size].neutral
 
 
 def values(effects: Mapping[str, Mapping[str, float]]) -> Values | None:
-    """Flatten the active effects that the equations hold; None when there is none.
+    """Flatten the active effects of the equations.
 
     Args:
         effects: effect id -> parameter name -> value, complete (see `parameters.from_flat`).
+
+    Returns:
+        Their parameters; None if no effect is active.
     """
     active = {id_: p for id_, p in effects.items()
               if id_ in CATALOGUE and CATALOGUE[id_].in_equations and is_active(id_, p)}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Duty signals that make a rig show what it is made of. Pure: settings in, one array out."""
+"""Duty signals that excite a rig for identification. Pure functions: settings in, one array out."""
 
 import math
 from collections.abc import Callable
@@ -15,24 +15,24 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Excitation:
-    """One duty signal. Fields that a kind has no use for are ignored by it.
+    """One duty signal. Each kind uses only the fields that it names.
 
     Attributes:
         kind: one of `KINDS`.
-        duration: length of the signal, s.
+        duration: [s] length of the signal.
         seed: the same seed gives the same signal.
-        duty_min: least duty of latin_hypercube, staircase and multisine, 0..1.
-        duty_max: greatest duty of the same.
-        hold_min: shortest hold of latin_hypercube, s.
-        hold_max: longest hold of latin_hypercube; how long steps holds each duty and free_decay lifts, s.
+        duty_min: smallest duty of latin_hypercube, staircase and multisine, 0..1.
+        duty_max: greatest duty of these, 0..1.
+        hold_min: [s] shortest hold of latin_hypercube.
+        hold_max: [s] longest hold of latin_hypercube, hold of steps, lift of free_decay.
         levels: intervals of the Latin hypercube; stairs of staircase.
-        rest: duty 0 after each Latin hypercube and after each lift of free_decay, s.
-        duty: of hold and free_decay, 0..1.
+        rest: [s] time with duty 0 after each Latin hypercube and after each lift of free_decay.
+        duty: duty of hold and free_decay, 0..1.
         sequence: duties of steps, repeated, 0..1.
-        frequencies: of multisine, Hz.
+        frequencies: [Hz] frequencies of multisine.
 
     Raises:
-        ValueError: on fields that contradict each other, in one line.
+        ValueError: the fields contradict each other; one line.
     """
 
     kind: str = "latin_hypercube"
@@ -77,7 +77,7 @@ class Excitation:
                 raise ValueError(message)
 
     def series(self) -> Array:
-        """Return the duty at each sample, (N,), 0..1, each held for one `SAMPLE_PERIOD`."""
+        """The duty (N,) at each sample, 0..1, held for one `SAMPLE_PERIOD`."""
         return KINDS[self.kind](self)
 
     @property
@@ -87,7 +87,7 @@ class Excitation:
 
 
 def _held(holds: list[tuple[float, float]], samples: int) -> Array:
-    """Sample (duty, seconds) holds; the last one is prolonged."""
+    """Sample a list of holds (duty, seconds); the last one is prolonged."""
     duties = np.array([duty for duty, _ in holds])
     ends = np.cumsum([seconds for _, seconds in holds])
     at = np.searchsorted(ends, (np.arange(samples) + 0.5) * SAMPLE_PERIOD)
@@ -97,8 +97,8 @@ def _held(holds: list[tuple[float, float]], samples: int) -> Array:
 def latin_hypercube(x: Excitation) -> Array:
     """Holds drawn from a Latin hypercube over (duty, hold time), thesis section 5.1.
 
-    Both ranges are cut into `levels` intervals; each interval of either is used once, in random pairs and order. Then
-    the duty rests at 0, so that the arm also swings freely, and the next hypercube is drawn, until the time is over.
+    Both ranges are cut into `levels` intervals. Each interval is used once, in random pairs and order. Then the duty is
+    0 for `rest` seconds, so that the arm also swings freely. Further hypercubes follow until the end of the signal.
     """
     rng = np.random.default_rng(x.seed)
     holds: list[tuple[float, float]] = []
@@ -114,22 +114,22 @@ def latin_hypercube(x: Excitation) -> Array:
 
 
 def steps(x: Excitation) -> Array:
-    """`sequence`, each duty for `hold_max` seconds, again and again."""
+    """The duties of `sequence`, each for `hold_max` seconds, repeated."""
     repeats = math.ceil(x.duration / (x.hold_max * len(x.sequence)))
     return _held([(duty, x.hold_max) for duty in x.sequence] * repeats, x.samples)
 
 
 def staircase(x: Excitation) -> Array:
-    """From `duty_min` to `duty_max` and back in equal stairs that fill the duration; `levels` different duties."""
+    """From `duty_min` to `duty_max` and back in equal stairs over the whole duration; `levels` different duties."""
     up = np.linspace(x.duty_min, x.duty_max, x.levels).tolist()
     stairs = up + up[-2::-1]
     return _held([(duty, x.duration / len(stairs)) for duty in stairs], x.samples)
 
 
 def multisine(x: Excitation) -> Array:
-    """Sines of equal amplitude that together fill `duty_min`..`duty_max`.
+    """Sum of sines of equal amplitude, scaled to `duty_min`..`duty_max`.
 
-    Of 100 sets of random phases, the one with the least peak for its power is taken.
+    Of 100 sets of random phases, the one with the smallest peak-to-peak value is taken.
     """
     rng = np.random.default_rng(x.seed)
     t = np.arange(x.samples) * SAMPLE_PERIOD
@@ -145,17 +145,17 @@ def multisine(x: Excitation) -> Array:
 
 
 def free_decay(x: Excitation) -> Array:
-    """Lift with `duty` for `hold_max` seconds, then let go for `rest` seconds, again and again."""
+    """Lift with `duty` for `hold_max` seconds, then duty 0 for `rest` seconds, repeated."""
     repeats = math.ceil(x.duration / (x.hold_max + x.rest))
     return _held([(x.duty, x.hold_max), (0.0, x.rest)] * repeats, x.samples)
 
 
 def hold(x: Excitation) -> Array:
-    """`duty` all the time."""
+    """A constant `duty`."""
     return np.full(x.samples, x.duty)
 
 
 KINDS: dict[str, Callable[[Excitation], Array]] = {
     function.__name__: function for function in (latin_hypercube, steps, staircase, multisine, free_decay, hold)
 }
-"""Every kind of signal by name."""
+"""All kinds of signal by name."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The numbers of the model: names, units, ranges, presets, and the ROS 2 parameter files that hold them."""
+"""The parameters of the model: names, units, ranges, presets, and the ROS 2 parameter files that hold them."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
 from aeropend_sim.untrusted import load_yaml, one_line, printable
 
 SAMPLE_PERIOD = 64 * 510 / 16e6
-"""Sample period in s: Timer1 of a 16 MHz ATmega2560, 8-bit phase-correct PWM, prescaler 64 (thesis 4.3.2)."""
+"""[s] Sample period: Timer1 of a 16 MHz ATmega2560, 8-bit phase-correct PWM, prescaler 64 (thesis 4.3.2)."""
 
 PRESETS = ("bench", "thesis")
 
 SECTIONS = ("model", "sensing", "effects")
-"""The parts of a model file; a node's own parameters may stand beside them."""
+"""The sections of a model file. The parameters of a node may stand beside them."""
 
 
 class ModelError(ValueError):
-    """A model file, a preset or a number that cannot be used; the message is one line for a person."""
+    """A model file, preset or value that cannot be used. The message is one line."""
 
     def __init__(self, text: str) -> None:
         super().__init__(one_line(text))
@@ -35,7 +35,14 @@ class ModelError(ValueError):
 
 @dataclass(frozen=True)
 class Parameter:
-    """What a number of the model is: its unit, the range that makes sense, and what it means."""
+    """A parameter of the model.
+
+    Attributes:
+        unit: its unit; "-" for none.
+        low: smallest value.
+        high: greatest value.
+        description: its meaning.
+    """
 
     unit: str
     low: float
@@ -71,7 +78,7 @@ PARAMETERS: dict[str, Parameter] = {
     "sensing.speed_tick": _P("s", 0.0, 0.1, "resolution of the pulse times; 0 = continuous"),
     "sensing.speed_noise": _P("rad/s", 0.0, 1e3, "standard deviation of a speed read"),
 }
-"""Every number of a model file outside `effects`, as `section.name`."""
+"""All parameters of a model file outside `effects`, as `section.name`."""
 
 MODEL_NAMES = tuple(key[len("model."):] for key in PARAMETERS if key.startswith("model."))
 SENSING_NAMES = tuple(key[len("sensing."):] for key in PARAMETERS if key.startswith("sensing."))
@@ -79,9 +86,13 @@ SENSING_NAMES = tuple(key[len("sensing."):] for key in PARAMETERS if key.startsw
 
 @dataclass(frozen=True)
 class Model:
-    """A complete model: the plant's numbers, the measurement chain's, and the active effects, all SI.
+    """A complete model, in SI units.
 
-    `model` and `sensing` hold every name of `PARAMETERS`; `effects` maps an effect's id to all of its parameters.
+    Attributes:
+        name: preset or file that it comes from.
+        model: parameters of the plant by name.
+        sensing: parameters of the measurement chain by name.
+        effects: active effects: id -> parameter name -> value, with all parameters of the effect.
     """
 
     name: str
@@ -90,7 +101,7 @@ class Model:
     effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     def numbers(self) -> dict[str, float]:
-        """The plant's numbers with `parameter_mismatch` applied."""
+        """The parameters of the plant, with `parameter_mismatch` applied."""
         return {**self.model, **self.effects.get(PARAMETER_MISMATCH, {})}
 
     def effect(self, id_: str, parameter: str) -> float:
@@ -103,7 +114,11 @@ class Model:
         return float(self.effects.get(id_, {}).get(parameter, CATALOGUE[id_].parameters[parameter].neutral))
 
     def with_effects(self, effects: Mapping[str, Mapping[str, float]]) -> Model:
-        """The same model with these effects in place of its own."""
+        """The same model with other effects.
+
+        Args:
+            effects: id -> parameter name -> value, complete.
+        """
         return Model(self.name, self.model, self.sensing, effects)
 
 
@@ -126,9 +141,9 @@ def from_flat(flat: Mapping[str, object], name: str = "model", base: Model | Non
     """Build a model from dotted names, e.g. `model.R_a`, `effects.coulomb_friction.accel`.
 
     Args:
-        flat: dotted name -> number. An effect's missing parameters take the catalogue's defaults.
-        name: what messages call the source of these numbers, usually the file.
-        base: supplies what `flat` leaves out; without it every `model.*` and `sensing.*` name must be given.
+        flat: dotted name -> value. Missing parameters of an effect take the defaults of the catalogue.
+        name: source of the values for error messages, usually the file.
+        base: supplies the missing values. Without it all `model.*` and `sensing.*` names must be given.
 
     Raises:
         ModelError: unknown name, not a number, out of range, or missing.
@@ -185,7 +200,7 @@ def _read_effect(effects: dict[str, dict[str, float]], rest: str, value: object,
 
 
 def to_flat(model: Model) -> dict[str, float]:
-    """The inverse of `from_flat`: dotted name -> number."""
+    """The inverse of `from_flat`: dotted name -> value."""
     flat = {f"model.{key}": value for key, value in model.model.items()}
     flat.update({f"sensing.{key}": value for key, value in model.sensing.items()})
     flat.update({f"effects.{id_}.{key}": value
@@ -194,7 +209,12 @@ def to_flat(model: Model) -> dict[str, float]:
 
 
 def flatten(tree: Mapping[str, object], prefix: str = "") -> dict[str, object]:
-    """Nested mappings to dotted names; an empty section (as in `effects: {}`) adds nothing."""
+    """Turn nested mappings into dotted names; an empty section (as in `effects: {}`) adds nothing.
+
+    Args:
+        tree: nested mappings.
+        prefix: put before each name.
+    """
     flat: dict[str, object] = {}
     for key, value in tree.items():
         if isinstance(value, Mapping) and value:
@@ -207,10 +227,13 @@ def flatten(tree: Mapping[str, object], prefix: str = "") -> dict[str, object]:
 def load(source: str | Path) -> Model:
     """Read a preset (`bench`, `thesis`) or a model file.
 
-    Keys of a node's own that are not the model's (anything outside `model`, `sensing`, `effects`) are left to the node.
+    Keys outside `model`, `sensing` and `effects` are parameters of a node and are ignored.
+
+    Args:
+        source: name of a preset, or path.
 
     Raises:
-        ModelError: no such preset or file, not a ROS 2 parameter file, or a number in it is unusable.
+        ModelError: no such preset or file, not a ROS 2 parameter file, or a value in it cannot be used.
     """
     if str(source) in PRESETS:
         name, text = str(source), (files("aeropend_sim") / "config" / f"{source}.yaml").read_text(encoding="utf-8")
@@ -234,7 +257,7 @@ def load(source: str | Path) -> Model:
 
 
 class _Loader(yaml.SafeLoader):
-    """Reads numbers as rcl does (1e-5 is one, which YAML 1.1 takes for text), and no key twice."""
+    """Reads numbers as rcl does (1e-5 is a number, which is text in YAML 1.1), and refuses repeated keys."""
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 - PyYAML's own
 
@@ -271,15 +294,15 @@ def _node_parameters(tree: object, name: str) -> dict[str, object]:
 
 
 def save(model: Model, path: str | Path, comment: str = "") -> None:
-    """Write a model file that the plant node and `load` read alike; replaces `path` in one step.
+    """Write a model file for the plant node and `load`; `path` is replaced in one step.
 
     Args:
-        model: what to write; its `name` is not written.
+        model: the model; its `name` is not written.
         path: the file.
-        comment: lines put at the top, each behind `# `.
+        comment: lines at the top of the file; each gets the prefix `# `.
 
     Raises:
-        ModelError: the file cannot be written; what was there before is untouched.
+        ModelError: the file cannot be written. An old file is then unchanged.
     """
     tree: dict[str, object] = {"model": dict(model.model), "sensing": dict(model.sensing)}
     if model.effects:  # rcl's parser refuses an empty mapping
@@ -303,7 +326,7 @@ def save(model: Model, path: str | Path, comment: str = "") -> None:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes floats so that YAML 1.1 and rcl read them back as floats, to the last bit."""
+    """Writes floats so that YAML 1.1 and rcl read the same floats back."""
 
 
 def _represent_float(dumper: yaml.SafeDumper, value: float) -> yaml.ScalarNode:

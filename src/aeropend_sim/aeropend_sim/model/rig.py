@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class Sample(NamedTuple):
-    """What the rig reports at an instant: rad, rad/s, A, V."""
+    """Readings of one sample: rad, rad/s, A, V."""
 
     theta: float
     omega: float
@@ -25,7 +25,7 @@ class Sample(NamedTuple):
 
 
 class Truth(NamedTuple):
-    """The state at that instant before the measurement chain: rad, rad/s, A, rad/s, V, rad."""
+    """True state of one sample, before the measurement chain: rad, rad/s, A, rad/s, V, rad."""
 
     theta: float
     theta_dot: float
@@ -36,7 +36,13 @@ class Truth(NamedTuple):
 
 
 class Rig:
-    """A rig that starts at rest, hanging; the same model, seed and duties give the same samples to the last bit."""
+    """A simulated rig that starts at rest, hanging. The same model, seed and duties give the same samples to the bit.
+
+    Args:
+        model: parameters and effects.
+        seed: seed of all random numbers.
+        period: [s] time between samples.
+    """
 
     def __init__(self, model: Model, seed: int = 0, period: float = SAMPLE_PERIOD) -> None:
         self.model, self.seed, self.period = model, seed, period
@@ -48,10 +54,10 @@ class Rig:
         self.reset()
 
     def reset(self) -> None:
-        """Back to rest, hanging, with a fresh supply, and to the start of the random numbers."""
+        """Return to the start: at rest, hanging, with a full battery and the first random numbers."""
         kicks, normal, uniform, turn = np.random.SeedSequence(self.seed).spawn(4)
         self._kicks, self._normal, self._uniform = (np.random.default_rng(s) for s in (kicks, normal, uniform))
-        # where the propeller stands when it starts is chance; it decides when the first pulse comes
+        # the first angle of the propeller is random; it decides the time of the first pulse
         angle = 2.0 * math.pi * float(np.random.default_rng(turn).random())
         self._state = dynamics.State(rotor_angle=angle)
         self._memory = sensing.NOTHING_READ
@@ -62,7 +68,7 @@ class Rig:
         """Read the rig and advance it over each duty in turn, held for one period.
 
         Args:
-            duty: (N,) 0..1; sample k is read with duty[k] applied, which then acts until sample k + 1.
+            duty: (N,) 0..1; duty[k] acts from sample k, at which it is already applied, to sample k + 1.
 
         Returns:
             Readings (4, N) in the order of `Sample`, and states (7, N) in the order of `dynamics.Trajectory`.
@@ -83,17 +89,24 @@ class Rig:
         return read, truth
 
     def sample(self, duty: float) -> tuple[Sample, Truth]:
-        """Read the rig at this instant with a duty (0..1) applied, then advance it over one period."""
+        """Read the rig, then advance it over one period.
+
+        Args:
+            duty: 0..1; it is applied when the rig is read.
+        """
         read, truth = self.run(np.array([duty]))
         return Sample(*read[:, 0].tolist()), Truth(*truth[:len(Truth._fields), 0].tolist())
 
 
 def record(model: Model, duty: Array, seed: int = 0, period: float = SAMPLE_PERIOD
            ) -> tuple[dict[str, Array], dict[str, Array]]:
-    """A whole series at once: what a fresh rig reports, and its true states.
+    """Simulate a new rig over a series of duties.
 
     Args:
-        model: numbers and effects; duty: (N,) 0..1; seed: of all chance; period: s.
+        model: parameters and effects.
+        duty: (N,) 0..1.
+        seed: seed of all random numbers.
+        period: [s] time between samples.
 
     Returns:
         Readings by the names of `Sample`, states by the names of `dynamics.Trajectory`; each (N,).

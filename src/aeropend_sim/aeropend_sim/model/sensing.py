@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the rig reports of a state: angle filter, quantisation, pulse-timed speed, noise, and the effects of sensing.
+"""The measurement chain: from the state of the plant to the reading.
 
-Order of the chain: the encoder's error (`angle_offset`, `encoder_eccentricity`), the two-stage filter (`encoder_lag`
-makes it slower), noise, quantisation; for the current gain, offset, noise, quantisation; for the speed the time between
-pulses (`speed_spikes` falsify it).
+Order for the angle: error of the encoder (`angle_offset`, `encoder_eccentricity`), two-stage filter (slower with
+`encoder_lag`), noise, quantisation. For the current: gain, offset, noise, quantisation. For the voltage: offset, noise,
+quantisation. The speed is the angle between two pulses over their time difference; `speed_spikes` makes some of these
+times false.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 Array = NDArray[np.float64]
 
 SPEED_TIMEOUT = 0.5
-"""s without a pulse after which the speed reads 0 (contract section 3)."""
+"""[s] Time without a pulse after which the speed reads 0. Convention, as in the firmware (speed.h)."""
 
 
 class Chain(NamedTuple):
-    """The measurement chain of a model, precomputed for one sample period; SI."""
+    """The measurement chain of a model, precomputed for one sample period, in SI units."""
 
     h: float
     filter: Lag
@@ -50,7 +51,7 @@ class Chain(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What the chain remembers from sample to sample."""
+    """State of the measurement chain between two samples."""
 
     stage1: float
     stage2: float
@@ -111,7 +112,12 @@ def angle_filter_tau(model: Model) -> float:
 
 
 def prepare(model: Model, period: float = SAMPLE_PERIOD) -> Chain:
-    """What `read` needs of a model for samples `period` seconds apart."""
+    """The measurement chain of a model, for `read`.
+
+    Args:
+        model: sensing parameters and effects.
+        period: [s] time between samples.
+    """
     s, effect = model.sensing, model.effect
     tau = angle_filter_tau(model)
     rate = 1.0 / tau if tau > NO_LAG * period else 0.0
@@ -132,7 +138,15 @@ def _encoder(theta: float, c: Chain) -> float:
 
 @njit()
 def start(theta: float, theta_dot: float, omega: float, rotor_angle: float, c: Chain) -> Memory:
-    """The chain at rest at an angle, as long ago settled."""
+    """State of the chain when the filter has settled at an angle.
+
+    Args:
+        theta: [rad] true angle.
+        theta_dot: [rad/s] true rate.
+        omega: [rad/s] true speed of the rotor.
+        rotor_angle: [rad] true angle of the rotor.
+        c: the chain.
+    """
     angle = _encoder(theta, c)
     return Memory(angle, angle, theta, theta_dot, omega, rotor_angle, math.nan, math.nan, 0.0)
 
@@ -144,7 +158,14 @@ def _quantise(x: float, lsb: float) -> float:
 
 @njit()
 def filter_angle(m: Memory, theta: float, theta_dot: float, c: Chain) -> tuple[float, float]:
-    """Both stages of the angle filter over one period, the angle between the samples by its Hermite cubic."""
+    """Both stages of the angle filter after one period. Between the samples the angle is a Hermite cubic.
+
+    Args:
+        m: state of the chain at the sample before.
+        theta: [rad] true angle.
+        theta_dot: [rad/s] true rate.
+        c: the chain.
+    """
     now = _encoder(theta, c)
     if c.filter_rate == 0.0:
         return now, now
@@ -159,7 +180,16 @@ def filter_angle(m: Memory, theta: float, theta_dot: float, c: Chain) -> tuple[f
 
 @njit(nogil=True)
 def angle_reading(theta: Array, theta_dot: Array, c: Chain) -> Array:
-    """The angle (N,) that the encoder and its filter give for a motion (N,), before noise and quantisation."""
+    """Reading of the angle before noise and quantisation.
+
+    Args:
+        theta: (N,) [rad] true angle.
+        theta_dot: (N,) [rad/s] true rate.
+        c: the chain.
+
+    Returns:
+        (N,) [rad] output of the encoder and its filter.
+    """
     out = np.empty(theta.shape[0])
     m = start(theta[0], theta_dot[0], 0.0, 0.0, c)
     for k in range(theta.shape[0]):
@@ -173,7 +203,19 @@ def angle_reading(theta: Array, theta_dot: Array, c: Chain) -> Array:
 @njit()
 def time_pulses(m: Memory, omega: float, rotor_angle: float, uniform: Array, normal: float, c: Chain
                 ) -> tuple[float, float, float]:
-    """Last pulse (s), held speed (rad/s) and this instant (s), after the pulses since the last sample."""
+    """Speed from the pulses since the last sample.
+
+    Args:
+        m: state of the chain at the sample before.
+        omega: [rad/s] true speed.
+        rotor_angle: [rad] true angle of the rotor.
+        uniform: (2,) random numbers 0..1, for `speed_spikes`.
+        normal: standard normal number, for the noise.
+        c: the chain.
+
+    Returns:
+        Time of the last pulse (s), speed read (rad/s), and time of this sample (s).
+    """
     now = m.time + c.h
     last, speed = m.last_pulse, m.speed
     step = 2.0 * math.pi / c.pulses
@@ -203,14 +245,16 @@ def read(out: Array, truth: Array, normal: Array, uniform: Array, m: Memory, fir
     """Read N states in sequence.
 
     Args:
-        out: (4, N), filled with θ, ω, i_a, v_a as read; ω is 0 before two pulses.
-        truth: (7, N) as `dynamics.run` fills it.
-        normal: (N, 4) standard normal numbers; uniform: (N, 2) in 0..1.
-        m: the chain's memory; first: it has read nothing yet.
+        out: (4, N), filled with the readings θ, ω, i_a, v_a; ω is 0 before two pulses.
+        truth: (7, N) states, as `dynamics.run` fills it.
+        normal: (N, 4) standard normal numbers.
+        uniform: (N, 2) random numbers 0..1.
+        m: state of the chain.
+        first: whether the first sample is the first of all.
         c: the chain.
 
     Returns:
-        The memory after the last sample.
+        The state of the chain after the last sample.
     """
     for k in range(out.shape[1]):
         theta, theta_dot, i_a = truth[ROW.theta, k], truth[ROW.theta_dot, k], truth[ROW.i_a, k]
@@ -237,4 +281,4 @@ def read(out: Array, truth: Array, normal: Array, uniform: Array, m: Memory, fir
 
 
 NOTHING_READ = Memory(*(math.nan,) * 9)
-"""The memory before the first sample."""
+"""State of the chain before the first sample."""

@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The simulated rig as a ROS 2 node, with the topics, services and rate of the real one.
 
-Time. A thread of its own takes a sample every 2.040 ms, on absolute deadlines. Stamps are the deadlines, not the
-instants at which the thread woke, so they lie on an exact grid. A sample that is taken when the next one is already due
-counts as late; it is published all the same, and the thread catches up back to back. Only when the process stood still
-for more than `BACKLOG` samples are the older ones not published: the rig is moved on through them, so that its time
-stays equal to ROS time, and they count as lost, as on a real rig nobody listened to. When the system clock is set, the
-grid moves by whole periods and a warning says so.
+Real time. A thread takes a sample every 2.040 ms, at absolute deadlines. The stamps are the deadlines, not the instants
+at which the thread woke, so they lie on an exact grid. A sample counts as late if the next one is already due. It is
+still published, and the thread catches up without pauses. If the process stood still for more than `BACKLOG` samples,
+the older samples are not published and count as lost. The rig is simulated through them, so that its time stays equal
+to ROS time. If the system clock is set, the grid moves by whole periods, with a warning.
 
-Faster than real time (`speed` not 1), stamps are simulated time, which starts one period after 0, and `/clock` carries
-it before each sample. No sample is left out: simulated time runs slower than asked instead. Nothing waits for
-listeners, though: one that is too slow for the speed loses samples, and the stamps show it.
+Other speeds (`speed` not 1). The stamps are simulated time, which starts one period after 0, and `/clock` has it before
+each sample. No sample is left out: if the computer is too slow, simulated time runs slower than `speed`. The plant does
+not wait for subscribers: a slow one loses samples, and the stamps show the gap.
 
-Every parameter is read at start and fixed while the node runs: a recording belongs to one model.
+All parameters are read at the start and fixed while the node runs: a recording belongs to one model.
 """
 
 import math
@@ -52,19 +51,19 @@ from aeropend_sim.ros.worker import Worker
 
 PERIOD_NS = round(SAMPLE_PERIOD * 1e9)
 BACKLOG = 49
-"""How many samples late the thread may be and still publish them all: 100 ms."""
+"""Greatest number of late samples that are all published: 100 ms. A choice."""
 
 SETTINGS = {
-    "preset": Setting("bench", "model that supplies every number not given", choices=PRESETS),
+    "preset": Setting("bench", "model that supplies all parameters that are not set", choices=PRESETS),
     "seed": Setting(0, "seed of noise and gusts", low=0, high=2**31 - 1),
     "speed": Setting(
-        1.0, "simulated over real time; not 1: publishes /clock; 0: as fast as it goes", low=0.0, high=1e3
+        1.0, "simulated over real time; not 1: publishes /clock; 0: as fast as possible", low=0.0, high=1e3
     ),
     "publish_truth": Setting(False, "publish truth/joint_states and truth/armature"),
 }
 
 def _setting(name: str) -> Setting:
-    """Describe one number of a model file, by its full name."""
+    """Description of one parameter of a model file, by its full name."""
     section, _, rest = name.partition(".")
     if section == "effects":
         effect, _, key = rest.partition(".")
@@ -81,7 +80,7 @@ NUMBERS = [
     *(f"effects.{effect.id}.{key}" for effect in CATALOGUE.values() for key in effect.parameters),
     *(f"effects.{PARAMETER_MISMATCH}.{key}" for key in MODEL_NAMES),
 ]
-"""The full name of every number that a model file may hold."""
+"""The full names of all parameters of a model file."""
 
 USAGE = usage(
     "plant: the simulated aeropendulum. Publishes joint_states and armature at 490.196 Hz, takes duty_command.",
@@ -92,20 +91,20 @@ USAGE = usage(
         "plant --ros-args --params-file model.yaml -p publish_truth:=true",
         "plant --ros-args -p model.R_a:=1.2 -p effects.coulomb_friction.accel:=0.8",
     ],
-    "  model.*, sensing.*, effects.ID.*: the numbers of a model file; what an effect is not given takes its"
-    " default\n  effects: " + ", ".join([*CATALOGUE, PARAMETER_MISMATCH]),
+    "  model.*, sensing.*, effects.ID.*: the parameters of a model file; missing parameters of an effect take their"
+    " defaults\n  effects: " + ", ".join([*CATALOGUE, PARAMETER_MISMATCH]),
     further={name: _setting(name) for name in NUMBERS},
 )
 
 
 class Pace:
-    """The absolute deadlines of a periodic thread, and how well it keeps them.
+    """The absolute deadlines of a periodic thread, and statistics of its lateness.
 
     Args:
-        period_ns: between deadlines, ns of `clock`.
-        backlog: how many periods late a deadline may be met; older ones are given up.
-        clock: monotonic time, ns.
-        sleep: sleeps for seconds.
+        period_ns: [ns] time between deadlines.
+        backlog: greatest number of periods by which a deadline may be missed; older deadlines are skipped.
+        clock: returns monotonic time, ns.
+        sleep: sleeps for a number of seconds.
     """
 
     BIN_NS = 10_000
@@ -128,7 +127,7 @@ class Pace:
         self._histogram = [0] * (self.BINS + 1)
 
     def next(self) -> int:
-        """Sleep to the next deadline and return how many deadlines before it were given up."""
+        """Sleep until the next deadline, and return the number of deadlines that were skipped before it."""
         self.deadline += self._period
         wait = self.deadline - self._clock()
         while wait > 0:
@@ -146,7 +145,11 @@ class Pace:
         return given_up
 
     def percentile_ms(self, share: float) -> float:
-        """Return the lateness that this share of all deadlines stayed below, ms, in steps of 0.01 up to 10."""
+        """A percentile of the lateness, ms, in steps of 0.01 up to 10.
+
+        Args:
+            share: 0..1.
+        """
         wanted = share * sum(self._histogram)
         count = 0
         for at, number in enumerate(self._histogram):
@@ -163,7 +166,7 @@ class Plant(RigInterface):
         super().__init__("plant")
         given = overrides(self)
         settings, model = read_parameters(self, given)
-        # imported here: compiling can take seconds, and a signal must already be handled by then
+        # imported here: compiling can take seconds, and signals must be handled before
         from aeropend_sim.model.rig import Rig
 
         self._rig = Rig(model, settings["seed"])
@@ -263,11 +266,11 @@ class Plant(RigInterface):
 
 
 def read_parameters(node: Node, given: dict[str, Any]) -> tuple[dict[str, Any], Model]:
-    """Check and declare the node's parameters.
+    """Check and declare the parameters of the node.
 
     Args:
-        node: the plant's.
-        given: what was set, by full name.
+        node: the node of the plant.
+        given: the values that were set, by full name.
 
     Returns:
         The settings, and the model.
@@ -288,7 +291,7 @@ def read_parameters(node: Node, given: dict[str, Any]) -> tuple[dict[str, Any], 
 
 
 def _with_defaults(flat: dict[str, Any]) -> dict[str, Any]:
-    """Resolve what a parameter file leaves empty: `effects: {}`, and an effect without any of its parameters."""
+    """Replace the empty values of a parameter file: `effects: {}`, and an effect without parameters."""
     resolved: dict[str, Any] = {}
     for name, value in flat.items():
         effect = CATALOGUE.get(name.removeprefix("effects."))

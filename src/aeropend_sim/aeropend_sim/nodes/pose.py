@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rig's pose for robot_state_publisher, RViz and Foxglove.
+"""The pose of the rig for robot_state_publisher, RViz and Foxglove.
 
-No sensor measures the rotor's angle, so `joint_states` says NaN there. robot_state_publisher makes a transform of NaN
-of it, which tf2 refuses with an error each time. This node publishes the same samples, fewer of them, with the rotor's
-angle integrated from its speed: where it began is not known, which nobody sees.
+No sensor measures the angle of the rotor, so it is NaN in `joint_states`. robot_state_publisher then makes a transform
+of NaN, which tf2 refuses with an error each time. This node publishes some of the samples with the angle of the rotor,
+integrated from its speed. The angle at the start is unknown; it does not matter for a picture.
 """
 
 import math
@@ -22,23 +22,22 @@ from aeropend_sim.ros.settings import Setting, overrides, read_settings
 from aeropend_sim.ros.usage import usage
 
 PAUSE_S = 0.5
-"""The rotor does not turn over a longer pause between samples, s."""
+"""[s] Over a longer pause between samples the rotor is not turned. A choice."""
 
 SETTINGS = {
-    "rate": Setting(50.0, "poses a second at most", "Hz", 1.0, 500.0),
-    "slow": Setting(20.0, "the propeller is shown turning this many times slower, so that an eye can follow", low=1.0,
-                    high=1e3),
+    "rate": Setting(50.0, "greatest rate of poses", "Hz", 1.0, 500.0),
+    "slow": Setting(20.0, "factor by which the propeller turns slower than measured, for the eye", low=1.0, high=1e3),
 }
 
 USAGE = usage(
-    "pose: publishes joint_states again on pose/joint_states, every joint with a position, to look at the rig in 3D.",
+    "pose: publishes joint_states again on pose/joint_states, with a position of each joint, to show the rig in 3D.",
     SETTINGS,
     [
         "pose",
         "pose --ros-args -p slow:=1.0",
         "pose --ros-args -r __ns:=/rig1",
     ],
-    "  With a ROS 2 install, the rig moves in RViz and Foxglove when this runs besides:\n"
+    "  With a ROS 2 installation, RViz and Foxglove show the rig if this runs too:\n"
     "  ros2 run robot_state_publisher robot_state_publisher $(ros2 pkg prefix --share aeropend_sim)/urdf/"
     "aeropendulum.urdf \\\n    --ros-args -r joint_states:=pose/joint_states\n"
     "  In RViz: fixed frame base, and a RobotModel of the topic robot_description.",
@@ -46,10 +45,10 @@ USAGE = usage(
 
 
 class Rotor:
-    """Where the propeller is, from how fast it turns.
+    """Angle of the propeller, integrated from its speed.
 
     Args:
-        slow: it turns this many times slower than measured.
+        slow: factor by which it turns slower than measured.
     """
 
     def __init__(self, slow: float = 1.0) -> None:
@@ -58,11 +57,11 @@ class Rotor:
         self._last_ns: int | None = None
 
     def turn(self, stamp_ns: int, omega: float) -> float:
-        """Return its angle at a sample, rad in -pi..pi.
+        """Angle at a sample, rad, in -pi..pi.
 
         Args:
-            stamp_ns: instant of the sample, ns.
-            omega: its speed, rad/s; NaN: not known, it stays.
+            stamp_ns: [ns] instant of the sample.
+            omega: [rad/s] speed; with NaN the angle stays.
         """
         passed = 0.0 if self._last_ns is None else 1e-9 * (stamp_ns - self._last_ns)
         self._last_ns = stamp_ns
@@ -72,7 +71,7 @@ class Rotor:
 
 
 class Pose(Node):
-    """The node."""
+    """The node; see the docstring of the module."""
 
     def __init__(self) -> None:
         super().__init__("pose", automatically_declare_parameters_from_overrides=True)
@@ -92,7 +91,7 @@ class Pose(Node):
             return
         try:
             message = deserialize_message(raw, JointState)
-        except Exception:  # of the middleware's own types
+        except Exception:  # its types are those of the middleware
             self._counts["malformed"] += 1
             return
         arm, rotor = interface.JOINTS

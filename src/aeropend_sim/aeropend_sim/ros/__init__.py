@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every node stands on: topics, parameters, diagnostics, threads and clocks."""
+"""The parts that all nodes share: topics, parameters, diagnostics, threads, clocks."""

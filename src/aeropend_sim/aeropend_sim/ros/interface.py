@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Topics, types and quality of service that the simulated plant and the hardware bridge share.
+"""Topics, message types and quality of service of an aeropendulum, simulated or real (docs/interfaces.md).
 
-Whoever talks to an aeropendulum, simulated or real, takes names, QoS and message layout from here. Names are relative,
-so namespaces and remapping work. Units are SI, angles in rad from hanging, duty a fraction 0..1, stamps in ns.
+All nodes take names, QoS and message layout from here. The names are relative, so that namespaces and remapping work.
+Units are SI, angles are in rad from the hanging position, a duty is a fraction 0..1, stamps are in ns.
 """
 
 import math
@@ -18,13 +18,13 @@ JOINT_STATES = "joint_states"
 ARMATURE = "armature"
 """`sensor_msgs/msg/BatteryState`: measured voltage and current, and the duty applied."""
 REFERENCE = "reference"
-"""`std_msgs/msg/Float64`: what a controller is to reach."""
+"""`std_msgs/msg/Float64`: reference of a controller."""
 DIAGNOSTICS = "/diagnostics"
-"""`diagnostic_msgs/msg/DiagnosticArray`, 1 Hz, from every node."""
+"""`diagnostic_msgs/msg/DiagnosticArray`, 1 Hz, from all nodes."""
 TRUTH_JOINT_STATES = "truth/joint_states"
 TRUTH_ARMATURE = "truth/armature"
 POSE = "pose/joint_states"
-"""`sensor_msgs/msg/JointState` from the node `pose`: what of `joint_states` can be drawn."""
+"""`sensor_msgs/msg/JointState` from the node `pose`: `joint_states` with all positions, for drawing."""
 ENABLE = "enable"
 """Service `std_srvs/srv/SetBool`: off means duty 0."""
 RESET = "reset"
@@ -34,34 +34,34 @@ JOINTS = ("arm", "rotor")
 ARMATURE_LOCATION = "armature"
 
 QOS = QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.KEEP_LAST, depth=100)
-"""Of every publisher and subscription: depth 100 bridges a stall of 200 ms at the sample rate."""
+"""QoS of all publishers and subscriptions. A depth of 100 covers a pause of 200 ms at the sample rate."""
 
 _NAN = math.nan
 _S = 1_000_000_000
 
 
 def stamp(stamp_ns: int) -> Time:
-    """Turn a stamp in ns since the epoch into a message."""
+    """Convert a stamp (ns since the epoch) to a message."""
     sec, nanosec = divmod(stamp_ns, _S)
     return Time(sec=sec, nanosec=nanosec)
 
 
 def stamp_ns(time: Time) -> int:
-    """Turn a stamp message into ns since the epoch."""
+    """Convert a stamp message to ns since the epoch."""
     return time.sec * _S + time.nanosec
 
 
 def joint_states_message(
     stamp_ns: int, theta: float, omega: float, theta_dot: float = _NAN, rotor_angle: float = _NAN
 ) -> JointState:
-    """Build one sample of `joint_states`; what is not measured stays NaN.
+    """Make one message of `joint_states`. Values that are not measured are NaN.
 
     Args:
-        stamp_ns: instant of sampling, ns since the epoch.
-        theta: arm angle from hanging, rad.
-        omega: rotor speed, rad/s.
-        theta_dot: arm rate, rad/s.
-        rotor_angle: rotor angle, rad.
+        stamp_ns: [ns] instant of sampling, since the epoch.
+        theta: [rad] arm angle from hanging.
+        omega: [rad/s] rotor speed.
+        theta_dot: [rad/s] arm rate.
+        rotor_angle: [rad] rotor angle.
     """
     message = JointState(name=list(JOINTS), position=[theta, rotor_angle], velocity=[theta_dot, omega], effort=[])
     message.header.stamp = stamp(stamp_ns)
@@ -69,12 +69,12 @@ def joint_states_message(
 
 
 def armature_message(stamp_ns: int, v_a: float, i_a: float, duty: float) -> BatteryState:
-    """Build one sample of `armature`; every float that has no meaning here is NaN.
+    """Make one message of `armature`. Fields without a meaning here are NaN.
 
     Args:
-        stamp_ns: instant of sampling, ns since the epoch.
-        v_a: armature voltage, V.
-        i_a: armature current, A, positive when it drives the motor.
+        stamp_ns: [ns] instant of sampling, since the epoch.
+        v_a: [V] armature voltage.
+        i_a: [A] armature current, positive when it drives the motor.
         duty: duty applied from this sample to the next, 0..1.
     """
     message = BatteryState(

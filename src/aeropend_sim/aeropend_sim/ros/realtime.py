@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keeping a periodic thread on time: priority, the garbage collector, and the two clocks."""
+"""Timing of a periodic thread: priority, garbage collector, and the offset between the two clocks."""
 
 import gc
 import os
@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 CLOCK_STEP_NS = 50_000_000
-"""A system clock that is off by more than this has been set."""
+"""[ns] Greater change of the offset between the clocks means that the system clock was set. A choice."""
 
 
 def prepare_thread() -> None:
@@ -31,7 +31,7 @@ def request_realtime_priority() -> None:
 
 
 def monotonic_to_ros_ns() -> int:
-    """Return what turns `time.monotonic_ns()` into system time, ns: the tightest of five readings."""
+    """System time minus `time.monotonic_ns()`, ns. The reading with the smallest uncertainty of five."""
     readings = []
     for _ in range(5):
         before = time.monotonic_ns()

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How messages travel: by UDP, on one machine too; how many may wait; and how soon who starts is found.
+"""Transport of the messages: UDP, also on one machine; size of the socket buffers; period of the announcements.
 
-Fast DDS has shared memory as well. There, whoever starts can stop all that others publish for 333 ms, which costs the
-plant 114 samples (https://github.com/eProsima/Fast-DDS/issues/6535), and whoever is killed can leave a lock on which
-the next to start waits for ever (https://github.com/eProsima/Fast-DDS/issues/1144).
+Fast DDS also has shared memory. There, a process that starts can block the publishers of all others for 333 ms, which
+costs the plant 114 samples (https://github.com/eProsima/Fast-DDS/issues/6535). A process that is killed can leave a
+lock on which the next process waits for ever (https://github.com/eProsima/Fast-DDS/issues/1144).
 
-What comes while a process stands still waits in its sockets. The usual 208 KiB are full after some 0.2 s at the sample
-rate, a publisher keeps 100 messages to send again, and the rest is lost. So our sockets ask for 4 MiB.
+While a process stands still, messages wait in its sockets. The usual buffer of 208 KiB is full after about 0.2 s at the
+sample rate, a publisher keeps 100 messages for repetition, and the others are lost. So the sockets ask for 4 MiB.
 
-Who starts announces itself before it listens. Who is there answers at once, and once only: the answer of a fast one is
-missed, and both then wait for its next regular announcement. So these come every second, not every three.
+A process that starts announces itself before it listens. The others answer at once and only once. A fast answer is
+lost, and both sides then wait for the next regular announcement. So the period of announcements is 1 s, not 3 s.
 """
 
 import os
@@ -20,26 +20,26 @@ from rclpy.utilities import get_rmw_implementation_identifier
 
 CONFIG = Path(__file__).parents[1] / "config"
 LOCALHOST = CONFIG / "localhost.xml"
-"""Profile of Fast DDS for this machine only: rmw_fastrtps has no LOCALHOST without shared memory."""
+"""Profile of Fast DDS for this machine only. In rmw_fastrtps itself, LOCALHOST means shared memory."""
 SUBNET = CONFIG / "subnet.xml"
-"""Profile of Fast DDS for any other range."""
+"""Profile of Fast DDS for all other ranges."""
 RANGE, PROFILES, TRANSPORTS = (
     "ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_BUILTIN_TRANSPORTS"
 )  # fmt: skip
 UDP = "UDPv4"
 OTHERS = ("FASTDDS_DEFAULT_PROFILES_FILE", "ROS_LOCALHOST_ONLY")
 FOUND_BY_NAME = ("DEFAULT_FASTRTPS_PROFILES.xml", "DEFAULT_FASTDDS_PROFILES.xml")
-"""Profiles that Fast DDS takes from the folder in which a process starts."""
+"""Names of profiles that Fast DDS reads from the working directory of a process."""
 
 
 def without_shared_memory(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Let this process, and those it starts, talk by UDP alone; to be called before `rclpy.init`.
+    """Use only UDP in this process and in those that it starts. Call it before `rclpy.init`.
 
-    Who is found stays as it was (`ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_STATIC_PEERS`), and who has shared memory is
-    talked to by UDP. Nothing is changed for somebody who chose a profile or transports, or another middleware.
+    The range of discovery stays (`ROS_AUTOMATIC_DISCOVERY_RANGE`, `ROS_STATIC_PEERS`). Processes with shared memory are
+    reached by UDP. Nothing changes if the user has chosen a profile, transports, or another middleware.
 
     Args:
-        environment: is changed.
+        environment: the environment to change.
     """
     profile = LOCALHOST if environment.get(RANGE) == "LOCALHOST" else SUBNET
     if (
@@ -48,7 +48,7 @@ def without_shared_memory(environment: MutableMapping[str, str] = os.environ) ->
         or environment.get(TRANSPORTS, UDP) != UDP
         or any(environment.get(name) for name in OTHERS)
         or any(Path(name).is_file() for name in FOUND_BY_NAME)
-        or not profile.is_file()  # without it, SUBNET would be what it says
+        or not profile.is_file()  # without the file, the range would silently become SUBNET
     ):
         return
     environment[PROFILES] = str(profile)

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fit of the preset `bench` to the rig's measured step: `python -m aeropend_sim.studies.bench_fit [--plot FILE]`.
 
-The thesis prints four features of a step to a duty of 0.4314 from rest (6.2, Fig 6.1) and, apart from it, the natural
-frequency of the arm (4.3.1). `mgd_over_J`, `c_over_J`, `L_over_J` and `J_m` are the four numbers that no other bench
-test gives. They are fitted to the five measurements and a guess of J_m by least squares, each residual in units of how
-well its number is known (`TARGETS`). The step is read through the angle filter, as the rig's was.
+The thesis gives four features of a step from rest to a duty of 0.4314 (6.2, Fig 6.1) and, separately, the natural
+frequency of the arm (4.3.1). No other bench test gives the four parameters `mgd_over_J`, `c_over_J`, `L_over_J` and
+`J_m`. They are fitted by least squares to the five measurements and a guess of J_m. Each residual is in units of the
+standard deviation of its target (`TARGETS`). The simulated step passes the angle filter, as in the measurement.
 
-They cannot be met together. The print has t_r/t_p = 0.51; a plant of this structure that overshoots by more than 10 %
-stays below 0.44, whatever the four numbers are. Without the frequency t_p would still come 7 % late and t_r 7 % early,
-with mgd/J = 45, a swing of 6.7 rad/s, that hardly overshoots. So θ_ss and t_s are met, t_r comes out early and t_p
-late, and something shapes the rig's step that the nominal model does not hold; the catalogue of effects has candidates.
+The fit cannot meet all targets. The measured t_r/t_p is 0.51. In a plant of this structure that overshoots by more than
+10 % the ratio stays below 0.44 for all values of the four parameters. Without the target of the frequency, t_p would
+still be 7 % late and t_r 7 % early, with mgd/J = 45 (6.7 rad/s) and almost no overshoot. So θ_ss and t_s are met, t_r
+is early and t_p is late. The rig has an effect that the nominal model lacks; the catalogue of effects has candidates.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from aeropend_sim.model.step_features import step_features
 Array = NDArray[np.float64]
 
 DUTY = 0.4314
-"""The measured step, from rest (thesis 6.2)."""
+"""Duty of the measured step, from rest (thesis 6.2)."""
 
 DURATION = 8.0
-"""s that are simulated."""
+"""[s] Simulated time. A choice."""
 
 START = {"mgd_over_J": 29.8, "c_over_J": 2.3, "L_over_J": 87.6, "J_m": 1.0e-5}
-"""Where the fit starts: 5.46 rad/s squared, and guesses."""
+"""Start of the fit: mgd/J from the natural frequency of 5.46 rad/s, and guesses."""
 
 
 class Target(NamedTuple):
-    """A number to meet: its value, how well it is known (one standard deviation of its logarithm), and why."""
+    """A target of the fit: its value, the standard deviation of its logarithm, and the reason."""
 
     value: float
     sigma: float
@@ -62,36 +62,46 @@ TARGETS = {
 
 
 def with_numbers(base: Model, numbers: Mapping[str, float]) -> Model:
-    """`base` with some of its numbers replaced, read through its angle filter without noise and quantisation."""
+    """`base` with some parameters replaced, and with an angle sensor without noise and quantisation.
+
+    Args:
+        base: the model.
+        numbers: new values by name.
+    """
     sensing = {**base.sensing, "angle_lsb": 0.0, "angle_noise": 0.0}
     return Model(base.name, {**base.model, **numbers}, sensing)
 
 
 def step(model: Model) -> tuple[Array, Array]:
-    """Time (s) and angle read (rad), each (N,), of the step from rest to `DUTY`."""
+    """Time (N,) in s and angle read (N,) in rad of the step from rest to `DUTY`."""
     n = round(DURATION / SAMPLE_PERIOD)
     read, _ = record(model, np.full(n, DUTY))
     return SAMPLE_PERIOD * np.arange(n, dtype=float), read["theta"]
 
 
 def features(base: Model, numbers: Mapping[str, float]) -> dict[str, float]:
-    """What `TARGETS` names, and the overshoot, of `base` with these numbers."""
+    """The quantities of `TARGETS`, and the overshoot, of a model.
+
+    Args:
+        base: the model.
+        numbers: values that replace those of `base`, by name.
+    """
     model = with_numbers(base, numbers)
     found = step_features(*step(model), float(actuator.static_angle(model.model, DUTY)))
     return {**found._asdict(), "natural_frequency": math.sqrt(model.model["mgd_over_J"]), "J_m": model.model["J_m"]}
 
 
 def cost(found: Mapping[str, float]) -> float:
-    """Sum of squared residuals; infinite where the step has no such features."""
+    """Sum of squared residuals; infinite if the step lacks a feature."""
     if any(math.isnan(found[name]) for name in TARGETS):
         return math.inf
     return sum((math.log(found[name] / target.value) / target.sigma)**2 for name, target in TARGETS.items())
 
 
 def fit(base: Model) -> dict[str, float]:
-    """The four numbers that meet `TARGETS` best; deterministic.
+    """The four parameters that meet `TARGETS` best; deterministic.
 
-    The settling time jumps, so a simplex search is used, and started anew where it ends until nothing is gained.
+    The settling time is discontinuous, so a simplex search is used. It is restarted at its result until the cost stays.
     """
     def objective(logs: Array) -> float:
         return cost(features(base, dict(zip(START, np.exp(logs).tolist(), strict=True))))
@@ -107,12 +117,17 @@ def fit(base: Model) -> dict[str, float]:
 
 
 def rounded(numbers: Mapping[str, float]) -> dict[str, float]:
-    """The numbers to three digits, as the preset holds them."""
+    """The parameters to three digits, as in the preset."""
     return {name: float(f"{value:.2e}") for name, value in numbers.items()}
 
 
 def table(base: Model, fitted: Mapping[str, float]) -> str:
-    """Measured, before and after, as text."""
+    """A table of the measurements, the start and the fit.
+
+    Args:
+        base: the model.
+        fitted: the fitted parameters by name.
+    """
     columns = {"before": features(base, START), "fitted": features(base, rounded(fitted))}
     lines = [f"Step to a duty of {DUTY} from rest", "",
              f"{'':18}{'measured':>10}{'before':>10}{'fitted':>10}{'error':>8}{'known to':>10}"]
@@ -131,7 +146,12 @@ def table(base: Model, fitted: Mapping[str, float]) -> str:
 
 
 def plot(base: Model, fitted: Mapping[str, float], path: Path) -> None:
-    """Save a picture of the step before and after, with the measured features marked.
+    """Save a picture of the step before and after the fit, with the measured features.
+
+    Args:
+        base: the model.
+        fitted: the fitted parameters by name.
+        path: of the picture.
 
     Raises:
         ImportError: matplotlib is not installed.
