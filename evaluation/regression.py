@@ -30,6 +30,7 @@ from aeropend_ident.bags import recording
 from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.commands import identify
 from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.document import to_json
 from aeropend_ident.diagnosis.results import document
 from aeropend_ident.signals.from_bag import from_recording, signals_of
 from aeropend_ident.testing import bags, rigs
@@ -103,7 +104,7 @@ def diagnosed(folder: Path, names: tuple[str, ...], *, fit_nominal: bool) -> dic
         found = diagnose(model, signals, 1, fit_nominal=fit_nominal)
     except RecordingError as error:
         return {"error": str(error).replace(str(folder), "")}
-    body = document(found, list(names), "bench", 0.0)
+    body = to_json(document(found, list(names), "bench", 0.0))
     after = found.augmented
     sums = [{c: float(np.nansum(x * np.cos(np.arange(len(x))))) for c, x in run.items()}
             for run in (*found.before, *found.after)]

@@ -23,8 +23,9 @@ from joblib import Parallel, delayed
 from rich.progress import Progress
 
 from aeropend_ident.bags import recording
-from aeropend_ident.commands.diagnose import document
 from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.document import to_json
+from aeropend_ident.diagnosis.results import document
 from aeropend_ident.signals.from_bag import from_recording
 from aeropend_ident.testing import bags
 from aeropend_sim.model.parameters import load
@@ -80,7 +81,7 @@ def diagnose_all(out: Path, jobs: int, only: list[str]) -> None:
         path = out / "recordings" / name
         try:
             result = diagnose(model, [from_recording(recording.read(str(path)), model.sensing)], 1)
-            body = document(result, [name], MODEL, time.perf_counter() - started)
+            body = to_json(document(result, [name], MODEL, time.perf_counter() - started))
         except recording.RecordingError as error:
             body = {"error": str(error), "seconds": time.perf_counter() - started}
         (out / "verdicts" / f"{name}.json").write_text(json.dumps(body))

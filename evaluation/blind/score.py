@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from aeropend_ident.diagnosis.document import from_json
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
 
 KINDS = ("single", "none", "two", "outside")
@@ -121,24 +122,23 @@ def id_of(key: str) -> str:
 
 
 def answer_of_diagnosis(body: Mapping[str, Any] | None) -> Answer:
-    """Read a diagnosis.json (contract section 5); None, or one that holds an `error`, has failed."""
+    """The answer in a diagnosis document; None, or an object that holds an `error`, has failed."""
     if body is None or "error" in body:
         return Answer(FAILED, seconds=body["seconds"] if body else None)
-    which = body["which"]
-    rows = sorted(which["candidates"], key=lambda c: not c["found"])  # those found first, in the order given
-    candidates = tuple(Candidate(key_of(c["effect"], c["parameters"]), float(c["probability"]),
-                                 {k: (_number(p["low"]), _number(p["high"])) for k, p in c["parameters"].items()})
-                       for c in rows)
-    mismatches = [key_of(c["effect"], c["parameters"]) for c in rows
-                  if c["found"] and c["effect"] == PARAMETER_MISMATCH]
+    document = from_json(body)
+    which = document.which
+    rows = sorted(which.candidates, key=lambda c: not c.found)  # those found first, in the order given
+    candidates = tuple(Candidate(key_of(c.effect, c.parameters), float(c.probability),
+                                 {k: (p.low, p.high) for k, p in c.parameters.items()}) for c in rows)
+    mismatches = [key_of(c.effect, c.parameters) for c in rows if c.found and c.effect == PARAMETER_MISMATCH]
     found: list[str] = []
-    for effect in which["effects"]:
+    for effect in which.effects:
         found += (mismatches or [PARAMETER_MISMATCH]) if effect == PARAMETER_MISMATCH else [effect]
-    first = which["verdict"]
+    first = which.verdict
     if first == PARAMETER_MISMATCH:
         first = mismatches[0] if mismatches else first
-    return Answer(first, tuple(dict.fromkeys(found)), _named(first, which["not_separable"], candidates),
-                  body["where"]["place"], candidates, body["shrink"]["closed"], body["seconds"])
+    return Answer(first, tuple(dict.fromkeys(found)), _named(first, which.not_separable, candidates),
+                  document.where.place, candidates, document.closure.closed, document.seconds)
 
 
 def answer_of_peer(said: Mapping[str, Any] | None) -> Answer:
@@ -162,10 +162,6 @@ def _named(first: str, groups: Iterable[Sequence[str]], candidates: Sequence[Can
             elif entry != id_of(first):
                 named.append(entry)
     return tuple(dict.fromkeys(named))
-
-
-def _number(x: float | None) -> float:
-    return math.nan if x is None else float(x)
 
 
 # --- figures

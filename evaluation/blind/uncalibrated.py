@@ -23,6 +23,7 @@ from scipy.optimize import lsq_linear
 
 from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.document import to_json
 from aeropend_ident.diagnosis.results import document
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.testing import bags
@@ -220,7 +221,7 @@ def diagnose_all(out: Path, jobs: int) -> None:
         try:
             signals = signals_of(out / "recordings" / name, None, model.sensing, fit_nominal=True)
             result = diagnose(model, [signals], 1, fit_nominal=True)
-            body = document(result, [name], MODEL, time.perf_counter() - started)
+            body = to_json(document(result, [name], MODEL, time.perf_counter() - started))
         except RecordingError as error:
             body = {"error": str(error), "seconds": time.perf_counter() - started}
         (out / "verdicts" / f"{name}.json").write_text(json.dumps(body))

@@ -30,11 +30,17 @@ def verdict(effects: list[dict], first: str | None = None, place: str = "") -> d
     """What a perfect diagnosis says of these effects."""
     candidates = [{"effect": e["effect"], "place": e["place"], "probability": 0.99, "found": True,
                    "parameters": {k: {"value": v, "low": v - 1e-9, "high": v + 1e-9}
-                                  for k, v in e["parameters"].items()}} for e in effects]
-    return {"seconds": 5.0, "shrink": {"closed": 0.97 if effects else None},
-            "where": {"place": place or (effects[0]["place"] if effects else "none")},
+                                  for k, v in e["parameters"].items()}, "gap_after": None} for e in effects]
+    return {"format": 1, "bags": ["bag"], "model": "bench", "duration_s": 40.0, "samples": 19600,
+            "train_s": [0.0, 28.0], "held_out_s": [28.0, 40.0], "channels": {},
+            "where": {"place": place or (effects[0]["place"] if effects else "none"), "share": {}, "regions": []},
             "which": {"verdict": first or (effects[0]["effect"] if effects else "none"),
-                      "effects": [e["effect"] for e in effects], "candidates": candidates, "not_separable": []}}
+                      "effects": [e["effect"] for e in effects], "candidates": candidates, "numbers": {},
+                      "residuals": {}, "unexplained": [], "unknown": None, "not_separable": [],
+                      "next_experiment": None},
+            "shrink": {"gap": 0.5, "gap_after": 0.02, "floor": 0.01, "closed": 0.97 if effects else None,
+                       "low": None, "high": None},
+            "notes": [], "seconds": 5.0}
 
 
 def perfect() -> tuple[list[dict], dict[str, dict]]:
@@ -128,8 +134,7 @@ def move_intervals(by: float, every: int) -> Callable[[dict[str, dict]], None]:
 
 def empty_intervals(v: dict[str, dict]) -> None:
     for n in names(v, "s-", 8):
-        for p in v[n]["which"]["candidates"][0]["parameters"].values():
-            p["low"] = p["high"] = None
+        v[n]["which"]["candidates"][0]["parameters"] = {}
 
 
 def little_closed(v: dict[str, dict]) -> None:

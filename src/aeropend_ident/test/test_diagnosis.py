@@ -8,7 +8,7 @@ import pytest
 from evaluation.blind import cases
 
 from aeropend_ident.diagnosis.diagnosis import diagnose
-from aeropend_ident.diagnosis.results import verdict_lines
+from aeropend_ident.diagnosis.results import document, verdict_lines
 from aeropend_ident.signals.signals import from_arrays
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, recorded, steps
 from aeropend_sim.model import rig
@@ -90,30 +90,32 @@ def test_effects_all_over_the_chain_are_found_and_nothing_else():
 
 
 def far_off(number, factor):
-    """The verdict on a rig of which one number is off by a factor."""
+    """The document of a rig of which one number is off by a factor."""
     model = drawn_rig(80, {})
     model = Model("rig", {**model.model, number: factor * BENCH.model[number]}, model.sensing)
     duty = steps(40.0, 80)
     columns, _ = rig.record(model, duty, 80)
-    body = diagnose(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)], 2).body
-    assert body["which"]["verdict"] == "parameter_mismatch"
-    return body
+    found = diagnose(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)], 2)
+    made = document(found, ["bag"], "bench", 0.0)
+    assert made.which.verdict == "parameter_mismatch"
+    return made
 
 
 @pytest.mark.parametrize(("number", "factor"), [
     ("R_a", 1.4), ("mgd_over_J", 1.4), ("J_m", 1.4), ("R_a", 0.8), ("mgd_over_J", 0.845)])
 def test_a_number_that_is_far_off_is_named(number, factor):
-    found = candidate(far_off(number, factor), "parameter_mismatch")["parameters"]
+    candidates = far_off(number, factor).which.candidates
+    found = next(c for c in candidates if c.effect == "parameter_mismatch").parameters
     assert list(found) == [number]
-    assert found[number]["value"] == pytest.approx(factor * BENCH.model[number], rel=0.06)
+    assert found[number].value == pytest.approx(factor * BENCH.model[number], rel=0.06)
 
 
 def test_two_numbers_of_which_the_product_counts_are_not_separable():
-    body = far_off("L_over_J", 1.2)
-    (pair,) = body["which"]["not_separable"]
+    made = far_off("L_over_J", 1.2)
+    (pair,) = made.which.not_separable
     assert set(pair) == {"parameter_mismatch:L_over_J", "parameter_mismatch:k_thrust"}
-    assert all(name in body["which"]["next_experiment"]["why"] for name in pair)
-    assert any(line.startswith("  not separable") and pair[1] in line for line in verdict_lines(body))
+    assert all(name in made.which.next_experiment.why for name in pair)
+    assert any(line.startswith("  not separable") and pair[1] in line for line in verdict_lines(made))
 
 
 def test_what_the_catalogue_does_not_hold_is_unknown():

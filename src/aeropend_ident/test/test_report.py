@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from evaluation.blind import cases
 
-from aeropend_ident.commands.diagnose import document
 from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.document import from_json, to_json
 from aeropend_ident.diagnosis.report import curves, number_format
 from aeropend_ident.diagnosis.report import page as report_page
-from aeropend_ident.diagnosis.results import verdict_lines
+from aeropend_ident.diagnosis.results import document, verdict_lines
 from aeropend_ident.signals.signals import from_arrays
 from aeropend_ident.testing.rigs import BENCH, recorded
 from aeropend_sim.model.effects import CATALOGUE, PLACES
@@ -70,10 +70,14 @@ class Page(HTMLParser):
             if attributes.get("type") == "application/json"]
 
 
+def documented(diagnosis, bags=("my_bag",), model="bench", **which):
+    """The document of a diagnosis, with other entries in `which`."""
+    made = to_json(document(diagnosis, list(bags), model, 2.5))
+    return from_json({**made, "which": {**made["which"], **which}})
+
+
 def rendered(diagnosis, bags=("my_bag",), model="bench", command="diagnose my_bag", **which):
-    made = document(diagnosis, list(bags), model, 2.5)
-    made["which"] = {**made["which"], **which}
-    return report_page.render(diagnosis, json.loads(json.dumps(made)), command)
+    return report_page.render(diagnosis, documented(diagnosis, bags, model, **which), command)
 
 
 @pytest.fixture(scope="module")
@@ -221,8 +225,8 @@ def test_unknown(friction):
 @pytest.mark.parametrize(("reasons", "said"), [
     ([], "the catalogue does not explain."), (["theta is off", "omega is"], "not explain: theta is off; omega is.")])
 def test_reasons_for_an_unknown_are_said_where_there_are_any(friction, reasons, said):
-    which = {**friction.body["which"], "verdict": "unknown", "effects": [], "unexplained": reasons}
-    assert verdict_lines({**friction.body, "which": which})[0].endswith(said)
+    made = documented(friction, verdict="unknown", effects=[], unexplained=reasons)
+    assert verdict_lines(made)[0].endswith(said)
 
 
 def test_what_an_unknown_looks_like(strange):

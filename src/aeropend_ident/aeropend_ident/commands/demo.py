@@ -8,7 +8,6 @@ at random and written to a file that the plant alone is told of.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import signal
@@ -24,6 +23,8 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from aeropend_ident.diagnosis import document
+from aeropend_ident.diagnosis.document import DiagnosisDocument, DocumentError
 from aeropend_sim.cli.command import Parser
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import Model, load, save
@@ -122,20 +123,13 @@ def measure(folder: Path, rig: Path, duration: float, seed: int, console: Consol
     return bag
 
 
-def diagnose(folder: Path, bag: Path) -> dict[str, object]:
-    """Run `diagnose` on the recording; returns the content of diagnosis.json."""
+def diagnose(folder: Path, bag: Path) -> DiagnosisDocument:
+    """Run `diagnose` on the recording; returns its document."""
     result = subprocess.run([sys.executable, "-m", MODULES["diagnose"], str(bag), "--out", str(folder / "diagnosis")],
                             check=False)
     if result.returncode:
         raise DemoError(f"diagnose ended with {result.returncode}")
-    content = json.loads((folder / "diagnosis" / "diagnosis.json").read_text(encoding="utf-8"))
-    assert isinstance(content, dict)
-    return content
-
-
-def is_right(drawn: str, which: dict[str, object]) -> bool:
-    """Whether the verdict names what was drawn, first."""
-    return which["verdict"] == drawn
+    return document.read(folder / "diagnosis" / "diagnosis.json")
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -171,16 +165,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         seed = options.seed if options.seed is not None else int(np.random.default_rng().integers(1000))
         print(f"A rig whose flaw is hidden runs for {options.duration:g} s and is recorded; results go to {folder}")
         bag = measure(folder, folder / "rig.yaml", options.duration, seed, console)
-        content = diagnose(folder, bag)
-    except DemoError as error:
+        found = diagnose(folder, bag)
+    except (DemoError, DocumentError) as error:
         print(f"demo: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("demo: interrupted; every process was stopped", file=sys.stderr)
         return 130
-    which = content["which"]
-    assert isinstance(which, dict)
-    right = is_right(drawn, which)
+    right = found.which.verdict == drawn
     truth = ", ".join(f"{k} = {v:.4g}" for p in rig.effects.values() for k, v in p.items())
     hidden = f"{drawn} ({truth})" if truth else drawn
     print(f"hidden in the plant: {hidden}: the verdict is {'right' if right else 'WRONG'}")

@@ -111,11 +111,11 @@ def run(options: argparse.Namespace, command: str) -> None:
         found = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal,
                          progress=lambda what, share: show(share, what))
         shown = [{"bag": bag, **validate(found.model, found.augmented, s)} for bag, s in zip(options.test, tests)]
-        body = document(found, options.bags, options.model, time.monotonic() - started, shown)
-        results = Results.of(found, body, command)
+        made = document(found, options.bags, options.model, time.monotonic() - started, shown)
+        results = Results.of(found, made, command)
     results.write(out, overwrite=options.overwrite)
     print("\n".join(results.lines))
-    print(printable(f"{out / 'report.html'}   {out / 'augmented.yaml'}   {body['seconds']} s"))
+    print(printable(f"{out / 'report.html'}   {out / 'augmented.yaml'}   {results.document.seconds} s"))
 
 
 def run_each(options: argparse.Namespace) -> int:

@@ -168,8 +168,8 @@ def _examine(task: _Task) -> Outcome:
     threadpool_limits(1)
     try:
         found = diagnose(task.settings.model, [task.signals], 1, fit_nominal=task.settings.fit_nominal)
-        body = document(found, [task.bag], task.settings.name, task.reading + time.monotonic() - started)
-        return Outcome(task.bag, Results.of(found, body, task.command))
+        made = document(found, [task.bag], task.settings.name, task.reading + time.monotonic() - started)
+        return Outcome(task.bag, Results.of(found, made, task.command))
     except Exception as error:
         return Outcome(task.bag, None, _why(task.bag, error))
 
@@ -212,10 +212,10 @@ def row(outcome: Outcome, folder: str) -> dict[str, Any]:
     """An outcome as a row of the summary, by `COLUMNS`; `folder`: where its results are."""
     if outcome.results is None:
         return {**dict.fromkeys(COLUMNS, ""), "recording": outcome.bag, "error": outcome.error}
-    body = outcome.results.body
-    which, shrink = body["which"], body["shrink"]
-    values = (outcome.bag, folder, which["verdict"], body["where"]["place"], " ".join(which["effects"]), shrink["gap"],
-              shrink["gap_after"], shrink["closed"], shrink["low"], shrink["high"], body["seconds"], "")
+    found = outcome.results.document
+    which, closure = found.which, found.closure
+    values = (outcome.bag, folder, which.verdict, found.where.place, " ".join(which.effects), closure.gap,
+              closure.gap_after, closure.closed, closure.low, closure.high, found.seconds, "")
     return {name: "" if value is None else value for name, value in zip(COLUMNS, values)}
 
 

@@ -7,7 +7,7 @@ import base64
 import math
 import platform
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from datetime import datetime
 from importlib import metadata
 from typing import Any
@@ -17,6 +17,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.diagnosis import Diagnosis
+from aeropend_ident.diagnosis.document import DiagnosisDocument, to_json
 from aeropend_ident.diagnosis.report import curves
 from aeropend_ident.diagnosis.report.curves import HEIGHT, WIDTH
 from aeropend_ident.diagnosis.report.number_format import (
@@ -83,18 +84,18 @@ CALM = {"duty": 0.25, "theta": 0.2}
 """Range of a signal (1, rad) below which most effects hardly show."""
 
 
-def render(diagnosis: Diagnosis, document: Mapping[str, object], command: str) -> str:
+def render(diagnosis: Diagnosis, document: DiagnosisDocument, command: str) -> str:
     """Write the report.
 
     Args:
         diagnosis: what was found.
-        document: the content of `diagnosis.json` (contract of `diagnose`).
+        document: its document.
         command: the command line that led here.
 
     Returns:
         One HTML file that needs nothing else, neither network nor fonts.
     """
-    doc: Any = document
+    doc: Any = to_json(document)
     loader = PackageLoader("aeropend_ident", "diagnosis/report/templates")
     environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True,
                               undefined=StrictUndefined)

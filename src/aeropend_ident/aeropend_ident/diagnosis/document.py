@@ -1,0 +1,424 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The content of `diagnosis.json` as types, with its one writer and its one reader.
+
+    python -m aeropend_ident.diagnosis.document      print the JSON schema
+
+The field `closure` is the key "shrink", `basis` the key "from"; all other keys have the names of the fields.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from aeropend_ident.diagnosis import typed_json
+from aeropend_ident.diagnosis.typed_json import JsonError
+from aeropend_sim.errors import UserError
+from aeropend_sim.untrusted import one_line
+
+FORMAT = 1
+"""Number of the format that this version writes and reads."""
+
+
+class DocumentError(UserError):
+    """A file or an object is no diagnosis document."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """The gap of one channel on held-out data: RMS of simulated minus measured.
+
+    Attributes:
+        unit: unit of the channel and of the three values below.
+        gap: of the nominal model.
+        floor: what the measurement chain alone leaves: noise, resolution, pulse timing.
+        gap_after: of the augmented model.
+    """
+
+    unit: str
+    gap: float
+    floor: float
+    gap_after: float
+
+
+@dataclass(frozen=True)
+class Region:
+    """A range of a variable in which the misfit concentrates.
+
+    Attributes:
+        variable: name of the variable.
+        low: lower end, in the unit of the variable.
+        high: upper end, in the unit of the variable.
+        share: [0..1] share of the squared misfit.
+        time: [0..1] share of the time.
+    """
+
+    variable: str
+    low: float
+    high: float
+    share: float
+    time: float
+
+
+@dataclass(frozen=True)
+class Where:
+    """Where the gap arises.
+
+    Attributes:
+        place: place of the verdict, or "none".
+        share: [0..1] place -> share of the gap.
+        regions: ranges of operation in which the misfit concentrates.
+    """
+
+    place: str
+    share: Mapping[str, float]
+    regions: tuple[Region, ...]
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An estimate with its 95 % interval.
+
+    Attributes:
+        value: the estimate.
+        low: lower end of the interval.
+        high: upper end of the interval.
+    """
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A hypothesis that was ranked.
+
+    Attributes:
+        effect: id of the effect, or "parameter_mismatch".
+        place: where it acts.
+        probability: [0..1] its posterior probability among its rivals.
+        parameters: name -> estimate of each of its parameters.
+        found: whether it is part of the verdict.
+        gap_after: [share of the spread] total gap with it; null if it was not computed.
+    """
+
+    effect: str
+    place: str
+    probability: float
+    parameters: Mapping[str, Interval]
+    found: bool
+    gap_after: float | None
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """A refitted parameter of the model.
+
+    Attributes:
+        nominal: value in the nominal model.
+        value: the estimate; the mean over the recordings if each has its own.
+        low: lower end of the 95 % interval.
+        high: upper end of the 95 % interval.
+        determined: whether the recordings determine it; uncalibrated rigs only.
+        runs: estimate of each recording, if each has its own.
+        run_to_run: standard deviation between recordings, beyond the uncertainty of the estimates.
+    """
+
+    nominal: float
+    value: float
+    low: float
+    high: float
+    determined: bool | None = None
+    runs: tuple[Interval, ...] | None = None
+    run_to_run: float | None = None
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Tests of what the final fit of a channel leaves.
+
+    Attributes:
+        rms: RMS in units of a reading's noise.
+        white: [0..1] effective sample size over the number of readings; 1 for white noise.
+        dependence: [0..1] share of the mean square that free curves over inputs and states explain.
+    """
+
+    rms: float
+    white: float
+    dependence: float
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A free curve, linear between its knots.
+
+    Attributes:
+        variable: what it is drawn over, and in brackets what multiplies it.
+        unit: unit of the values.
+        at: positions of the knots, in the unit of the variable.
+        value: value at each knot.
+    """
+
+    variable: str
+    unit: str
+    at: tuple[float, ...]
+    value: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class UnknownEffect:
+    """An effect that the catalogue does not hold.
+
+    Attributes:
+        place: where it acts.
+        curves: the missing term is their sum.
+    """
+
+    place: str
+    curves: tuple[Curve, ...]
+
+
+Setting = bool | int | float | str | tuple[float, ...]
+"""Value of a parameter of the node `excite`."""
+
+
+@dataclass(frozen=True)
+class NextExperiment:
+    """The experiment that separates the closest pair of hypotheses.
+
+    Attributes:
+        why: the reason, as a sentence.
+        excite: parameters of the node `excite`; empty where no signal helps.
+    """
+
+    why: str
+    excite: Mapping[str, Setting]
+
+
+@dataclass(frozen=True)
+class Which:
+    """Which effect causes the gap.
+
+    Attributes:
+        verdict: id of the effect with the largest share, "parameter_mismatch", "none" or "unknown".
+        effects: ids of all effects found, the largest share first.
+        candidates: the ranked hypotheses, the most probable first.
+        numbers: name -> refitted parameter of the model.
+        residuals: channel -> tests of its residuals.
+        unexplained: reasons for the verdict "unknown", as sentences.
+        unknown: an effect that the catalogue does not hold; null if there is none.
+        not_separable: pairs of hypotheses that the recordings cannot separate.
+        next_experiment: what to record next; null if nothing is open.
+    """
+
+    verdict: str
+    effects: tuple[str, ...]
+    candidates: tuple[Candidate, ...]
+    numbers: Mapping[str, ParameterRow]
+    residuals: Mapping[str, Residual]
+    unexplained: tuple[str, ...]
+    unknown: UnknownEffect | None
+    not_separable: tuple[tuple[str, str], ...]
+    next_experiment: NextExperiment | None
+
+
+@dataclass(frozen=True)
+class ClosedGap:
+    """How far the gap closes. A total gap is the RMS over the channels, each in units of its own spread.
+
+    Attributes:
+        gap: [share of the spread] total gap of the nominal model.
+        gap_after: [share of the spread] total gap of the augmented model.
+        floor: [share of the spread] total gap of a perfect model.
+        closed: share of the closable gap that is closed, at most 1; null if there is nothing to close.
+        low: lower end of its 95 % interval; null if there is too little data.
+        high: upper end of its 95 % interval; null if there is too little data.
+    """
+
+    gap: float
+    gap_after: float
+    floor: float
+    closed: float | None
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True)
+class _OfBag:
+    """A base class whose field comes before those of the other bases."""
+
+    bag: str
+
+
+@dataclass(frozen=True)
+class Across(ClosedGap, _OfBag):
+    """How far the gap closes on a recording that nothing was fitted to.
+
+    Attributes:
+        bag: the recording.
+        gap: [share of the spread] total gap of the nominal model.
+        gap_after: [share of the spread] total gap of the augmented model.
+        floor: [share of the spread] total gap of a perfect model.
+        closed: share of the closable gap that is closed, at most 1; null if there is nothing to close.
+        low: lower end of its 95 % interval; null if there is too little data.
+        high: upper end of its 95 % interval; null if there is too little data.
+    """
+
+
+@dataclass(frozen=True)
+class Closure(ClosedGap):
+    """How far the gap closes on held-out data. A total gap is the RMS over the channels, each in units of its spread.
+
+    Attributes:
+        gap: [share of the spread] total gap of the nominal model.
+        gap_after: [share of the spread] total gap of the augmented model.
+        floor: [share of the spread] total gap of a perfect model.
+        closed: share of the closable gap that is closed, at most 1; null if there is nothing to close.
+        low: lower end of its 95 % interval; null if there is too little data.
+        high: upper end of its 95 % interval; null if there is too little data.
+        across: the same on further recordings, if there are any.
+    """
+
+    across: tuple[Across, ...] = ()
+
+
+@dataclass(frozen=True)
+class Lift:
+    """The static lift of a duty and its lag: all that duty and angle show of bridge, motor and propeller.
+
+    Attributes:
+        duty: (K,) [0..1] duties up to the largest of the recordings.
+        rad_per_s2: (K,) [rad/s^2] lift over the inertia of the arm.
+        dead_zone: [0..1] duty below which there is no lift.
+        lag_s: [s] time constant of the rotor at half of the largest duty.
+    """
+
+    duty: tuple[float, ...]
+    rad_per_s2: tuple[float, ...]
+    dead_zone: float
+    lag_s: float
+
+
+@dataclass(frozen=True)
+class HangingAngle:
+    """The angle that is read where the arm hangs.
+
+    Attributes:
+        value: [rad] the estimate; the mean over the recordings if each has its own.
+        low: [rad] lower end of the 95 % interval.
+        high: [rad] upper end of the 95 % interval.
+        runs: [rad] estimate of each recording, if each has its own.
+        run_to_run: [rad] standard deviation between recordings, beyond the uncertainty of the estimates.
+    """
+
+    value: float
+    low: float
+    high: float
+    runs: tuple[Interval, ...] | None = None
+    run_to_run: float | None = None
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What the nominal model of an uncalibrated rig was identified from.
+
+    Attributes:
+        basis: the signals, in words.
+        not_determined: parameters that the recordings do not determine.
+        lift: only where duty and angle are all that was measured.
+        hangs_at: only where it was fitted.
+    """
+
+    basis: str = field(metadata={"key": "from"})
+    not_determined: tuple[str, ...]
+    lift: Lift | None = None
+    hangs_at: HangingAngle | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiagnosisDocument:
+    """The content of `diagnosis.json`.
+
+    Attributes:
+        format: number of this format.
+        bags: the recordings.
+        model: the nominal model: a preset or a file.
+        duration_s: [s] length of all recordings.
+        samples: number of samples of all recordings.
+        train_s: [s] begin and end of the part that was fitted to.
+        held_out_s: [s] begin and end of the part that gaps are measured on.
+        channels: channel -> its gap.
+        where: where the gap arises.
+        which: which effect causes it.
+        closure: how far it closes.
+        identified: uncalibrated rigs only.
+        notes: what is unusual in the data, as sentences.
+        seconds: [s] time taken.
+    """
+
+    format: int
+    bags: tuple[str, ...]
+    model: str
+    duration_s: float
+    samples: int
+    train_s: tuple[float, float]
+    held_out_s: tuple[float, float]
+    channels: Mapping[str, Channel]
+    where: Where
+    which: Which
+    closure: Closure = field(metadata={"key": "shrink"})
+    identified: Identified | None = None
+    notes: tuple[str, ...]
+    seconds: float
+
+
+def to_json(document: DiagnosisDocument) -> dict[str, object]:
+    """The document as dicts, lists and scalars, in the order of the file."""
+    body: dict[str, object] = typed_json.to_json(document)
+    return body
+
+
+def from_json(data: object) -> DiagnosisDocument:
+    """Read a document from what `json.loads` returns.
+
+    Raises:
+        DocumentError: it is no document, or one of another format.
+    """
+    number = data.get("format") if isinstance(data, Mapping) else None
+    if not isinstance(number, int):
+        raise DocumentError("no diagnosis document: it has no format number; give a diagnosis.json of 'diagnose'")
+    if number != FORMAT:
+        advice = "update aeropend_ident" if number > FORMAT else "diagnose the recording again"
+        raise DocumentError(f"diagnosis document of format {number}, this version reads format {FORMAT}: {advice}")
+    try:
+        return typed_json.from_json(DiagnosisDocument, data)
+    except JsonError as error:
+        raise DocumentError(one_line(f"no valid diagnosis document: {error}; diagnose the recording again")) from None
+
+
+def read(path: Path) -> DiagnosisDocument:
+    """Read a `diagnosis.json`.
+
+    Raises:
+        DocumentError: it cannot be read, or is no document.
+    """
+    try:
+        return from_json(json.loads(path.read_text(encoding="utf-8")))
+    except OSError as error:
+        raise DocumentError(one_line(f"{path}: cannot be read: {error.strerror}; name a diagnosis.json")) from None
+    except (ValueError, RecursionError):
+        raise DocumentError(one_line(f"{path}: is no JSON; give a diagnosis.json of 'diagnose'")) from None
+    except DocumentError as error:
+        raise DocumentError(one_line(f"{path}: {error}")) from None
+
+
+def schema() -> dict[str, object]:
+    """The JSON schema of `diagnosis.json`."""
+    return typed_json.schema(DiagnosisDocument)
+
+
+if __name__ == "__main__":
+    print(json.dumps(schema(), indent=1, ensure_ascii=False))
