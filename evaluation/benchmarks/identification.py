@@ -49,7 +49,7 @@ def limits(seed: int, sigma: Array) -> dict[tuple[str, str], float]:
                     Entries.of(matrix))
     run = fitter.run(*fitter.point)
     assert run is not None
-    normal, _ = fitter.normal(run, fitter.model, fitter.residuals(run))
+    normal, _ = fitter.normal_equations(run, fitter.model, fitter.residuals(run))
     sd = np.sqrt(np.diag(np.linalg.inv(normal.H)))
     return {(STATES[e], LIBRARY.names[t]): float(s)
             for e, t, s in zip(fitter.model.equation, fitter.model.term, sd)}

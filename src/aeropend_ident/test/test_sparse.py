@@ -11,9 +11,9 @@ from aeropend_ident.identification.dataset import from_arrays
 from aeropend_ident.identification.discrepancy import nominal
 from aeropend_ident.identification.identify import identify
 from aeropend_ident.identification.output_error import Entries, Fitter
-from aeropend_ident.identification.output_error_selection import Linear
+from aeropend_ident.identification.output_error_selection import QuadraticMisfit
 from aeropend_ident.identification.problem import Problem
-from aeropend_ident.identification.subset_selection import Sums, select
+from aeropend_ident.identification.subset_selection import NormalEquations, ebic_search
 from aeropend_ident.identification.terms import thesis_terms
 from aeropend_ident.studies import lorenz
 from aeropend_sim.model import actuator, dynamics
@@ -56,12 +56,12 @@ def test_selection_finds_the_terms_that_made_the_data():
     rows = rng.standard_normal((2000, 20))
     rows[:, 5] = rows[:, 2] + 0.05 * rows[:, 5]  # nearly the same as a true one
     y = 3.0 * rows[:, 2] - 0.5 * rows[:, 11] + 0.1 * rng.standard_normal(2000)
-    assert select(Sums.of(rows, y)) == [2, 11]
+    assert ebic_search(NormalEquations.of(rows, y)) == [2, 11]
 
 
 def test_nothing_is_found_in_noise():
     rng = np.random.default_rng(1)
-    assert select(Sums.of(rng.standard_normal((2000, 30)), rng.standard_normal(2000))) == []
+    assert ebic_search(NormalEquations.of(rng.standard_normal((2000, 30)), rng.standard_normal(2000))) == []
 
 
 def test_the_nominal_equations_are_those_of_the_dynamics():
@@ -156,7 +156,7 @@ def test_such_a_term_is_left_out_where_held_out_data_do_not_miss_it():
 
 
 def test_a_choice_that_the_free_run_does_not_keep_is_taken_back(monkeypatch):
-    monkeypatch.setattr(Linear, "search", lambda linear, support: [])  # as near-collinear terms can make it
+    monkeypatch.setattr(QuadraticMisfit, "search", lambda misfit, support: [])  # as near-collinear terms can make it
     assert set(identify(pushed_once(0.02), "weak", TERMS).equations["x"]) == {"x", "u"}
 
 
@@ -168,8 +168,8 @@ def test_the_normal_equations_of_stretches_add_up_to_those_of_the_whole():
         fitter = Fitter(problem.experiment(2900), Entries.of(start), length)
         states = fitter.run(*fitter.point)
         residuals = fitter.residuals(states)
-        one, _ = fitter.normal(states, fitter.model, residuals)
-        many, _ = fitter.normal(states, fitter.model, residuals, blocks=24)
+        one, _ = fitter.normal_equations(states, fitter.model, residuals)
+        many, _ = fitter.normal_equations(states, fitter.model, residuals, blocks=24)
         assert len(many.blocks) == 24
         assert np.allclose(many.H, one.H, rtol=1e-9, atol=1e-9 * np.abs(one.H).max())
         assert np.allclose(many.g, one.g, rtol=1e-6, atol=1e-9 * np.abs(one.g).max())

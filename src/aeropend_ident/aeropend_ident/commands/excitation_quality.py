@@ -96,16 +96,15 @@ def quality(model: Model, data: Dataset, show: Show = nothing) -> list[Excited]:
             matrix[k] = [true[s].get(t, 0.0) for t in names]
     start = problem.widened(matrix)
     fitter = Fitter(problem.experiment(len(data)), Entries.of(start), 0, floor=1.0)
-    equation, term = np.nonzero(problem.candidates)
-    every = Entries(equation.astype(np.int64), term.astype(np.int64), np.zeros(len(term)))
+    every = Entries.candidates(problem.candidates)
     if fitter.run(*fitter.point) is None:
         raise RecordingError(f"{data.name}: the model runs away on it, so nothing can be said; check the model file")
     show(0.1, "fitting the readings")
     fitter.fit(rounds=5)
     show(0.5, "weighing every term")
-    linear, now, _ = linearise(fitter, every, start.shape)
+    misfit, now, _ = linearise(fitter, every, start.shape)
     sigma = np.sqrt(np.diag(fitter.covariance()))
-    rivals = list(alternatives(linear, every, now))
+    rivals = list(alternatives(misfit, every, now))
     found = []
     for k, (e, t) in enumerate(zip(fitter.model.equation.tolist(), fitter.model.term.tolist())):
         other = tuple(names[b] for f, a, b, _ in rivals if (f, a) == (e, t))

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What sparse identification works on: states and inputs on a grid, and what was really measured of them.
+"""Data of sparse identification: states and inputs on a grid, and the readings that show them.
 
-Of a rig, the angle is seen through a filter and the speed as the time between pulses; the angular rate is not seen at
-all. The regression works on the best description of the states that the readings give. The free runs go through the
-same filter and count the same pulses: the measurement chain's own states run along.
+The rig's angle is read through a filter, its speed as the time between pulses, and its angular rate is not read at all.
+The regression uses the best description of the states that the readings allow. The free runs go through the same filter
+and count the same pulses: the states of the measurement chain run with them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -26,22 +26,37 @@ from aeropend_ident.signals.smoothing import slow_part
 STATES = ("theta", "theta_dot", "i_a", "omega")
 INPUTS = ("v_a", "duty")
 RATE = "_dot"
-"""A state of this ending is the derivative of the one without it."""
+"""A state with this ending is the derivative of the state without it."""
 
 MOST_BAD = 0.2
-"""Share of readings of a channel that may be unusable; the fit leaves them out, the regression takes them as read."""
+"""Greatest share of unusable readings in a channel; the fit leaves them out, the regression uses them. Choice."""
 
 STANDS_OUT = 5.0
-"""A signal must vary by so many times its noise."""
+"""Least standard deviation of a signal over that of its noise. Choice."""
+
+NUMERIC = 1e-5
+"""Least noise of a signal over its standard deviation, for errors of sampling and integration. Choice: -100 dB."""
+
+FEWEST = 100
+"""Least number of samples. Choice."""
+
+SLOW_VOLTAGE = 0.05
+"""[s] Window over which the slow part of a held voltage is smoothed. Choice."""
 
 
 @dataclass(frozen=True)
-class Link:
-    """A state of the measurement chain: d(name)/dt = Σ coefficient · variable, at first that of `follows`, or 0."""
+class SensorState:
+    """A state of the measurement chain.
+
+    Attributes:
+        name: of the state.
+        rate: variable -> coefficient; the derivative of the state is their sum.
+        starts_as: state whose value is its initial value; "": it starts at 0.
+    """
 
     name: str
     rate: Mapping[str, float]
-    follows: str = ""
+    starts_as: str = ""
 
 
 @dataclass(frozen=True)
@@ -49,13 +64,21 @@ class Dataset:
     """One recording for sparse identification.
 
     Attributes:
-        name: for messages. states, inputs: names of the columns of `values` (N, S) and `held` (N, U).
-        period: s between samples.
-        outputs, means: what was measured, by the name of the variable that shows it (a state or a link).
-        chain: the measurement chain's states. derived: states that were not measured but differentiated.
-        derivatives: (N, S) where they are known exactly, else None.
-        noise: (S,) standard deviation of `values`. coarse: (S,) samples over which they are smooth by making.
-        train: samples that models are fitted to. notes: what a person should know.
+        name: of the data, for messages.
+        states: names of the S states.
+        inputs: names of the U inputs.
+        values: (N, S) the states, as the readings describe them.
+        held: (N, U) the inputs, held from sample to sample.
+        period: [s] sample period.
+        outputs: readings at the samples, each with the name of the variable that it shows (a state or a sensor state).
+        means: mean rates over intervals, each with the name of the variable that it shows.
+        sensor_states: the states of the measurement chain.
+        derived: states that are not measured but differentiated.
+        derivatives: (N, S) exact derivatives; None: they are not known.
+        noise: (S,) standard deviation of the noise of `values`; None: not known.
+        coarse: (S,) number of samples over which `values` were smoothed; None: they were not.
+        train: number of samples that models are fitted to; the rest is held out.
+        notes: remarks for the user.
     """
 
     name: str
@@ -66,7 +89,7 @@ class Dataset:
     period: float
     outputs: tuple[tuple[str, Output], ...]
     means: tuple[tuple[str, Means], ...] = ()
-    chain: tuple[Link, ...] = ()
+    sensor_states: tuple[SensorState, ...] = ()
     derived: frozenset[str] = frozenset()
     derivatives: Array | None = None
     noise: Array | None = None
@@ -79,20 +102,24 @@ class Dataset:
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """States and inputs: what terms are made of."""
+        """States and inputs: the variables of the terms."""
         return (*self.states, *self.inputs)
 
 
 def from_arrays(states: Mapping[str, Array], inputs: Mapping[str, Array], period: float, held_out: float = 0.25,
                 name: str = "data", derivatives: Mapping[str, Array] | None = None) -> Dataset:
-    """States (N,) and held inputs (N,) by name, all measured directly, noisy or not.
+    """A dataset of arrays; all states are measured directly, with noise or without.
 
     Args:
-        states, inputs: by name. period: s. held_out: share at the end that models are not fitted to.
-        name: for messages. derivatives: exact ones of every state by name, if they are known.
+        states: name -> (N,) readings.
+        inputs: name -> (N,) values, held from sample to sample.
+        period: [s] sample period.
+        held_out: share at the end that models are not fitted to.
+        name: of the data, for messages.
+        derivatives: name -> (N,) exact derivative of each state, if they are known.
 
     Raises:
-        RecordingError: not finite, too short, or nothing happens in it.
+        RecordingError: values are not finite, too few, or constant.
     """
     n = len(next(iter(states.values())))
     for kind in (states, inputs, derivatives or {}):
@@ -102,8 +129,8 @@ def from_arrays(states: Mapping[str, Array], inputs: Mapping[str, Array], period
             if not np.isfinite(x).all():
                 raise RecordingError(f"{name}: {column} is not a number in {int((~np.isfinite(x)).sum())} of {n} "
                                      "samples; identification needs a recording without holes")
-    if n < 100:
-        raise RecordingError(f"{name}: {n} samples are too few to identify anything")
+    if n < FEWEST:
+        raise RecordingError(f"{name}: {n} samples are too few; identification needs {FEWEST} or more")
     _check_alive(name, {**states, **inputs})
     values = np.column_stack(list(states.values())).astype(float)
     held = np.column_stack(list(inputs.values())).astype(float) if inputs else np.zeros((n, 0))
@@ -112,10 +139,6 @@ def from_arrays(states: Mapping[str, Array], inputs: Mapping[str, Array], period
     known = None if derivatives is None else np.column_stack([derivatives[s] for s in states])
     return Dataset(name, tuple(states), tuple(inputs), values, held, period, outputs, derivatives=known,
                    train=_train(n, held_out))
-
-
-NUMERIC = 1e-5
-"""Share of a signal's spread that sampling and running it costs, however little noise there is (100 dB)."""
 
 
 def _noise(values: Array) -> Array:
@@ -129,42 +152,45 @@ def _train(n: int, held_out: float) -> int:
 def _check_alive(name: str, columns: Mapping[str, Array]) -> None:
     for column, x in columns.items():
         if np.ptp(x) == 0.0:
-            raise RecordingError(f"{name}: {column} is {x[0]:g} all the time, so nothing can be identified with it; "
-                                 "record while `excite` runs, or leave it out (--states, --input)")
+            raise RecordingError(f"{name}: {column} is {x[0]:g} all the time, so no equation with it can be "
+                                 "identified; record while `excite` runs, or leave it out (--states, --input)")
         if np.std(x) < STANDS_OUT * float(noise_of(x)):
-            raise RecordingError(f"{name}: {column} does not stand out of its noise, so nothing can be identified "
-                                 "with it; record while `excite` runs, or leave it out (--states, --input)")
+            raise RecordingError(f"{name}: {column} varies too little beside its noise, so no equation with it can be "
+                                 "identified; record while `excite` runs, or leave it out (--states, --input)")
 
 
 def from_bag(read: Recording, sensing: Mapping[str, float], states: Sequence[str] = STATES,
              inputs: Sequence[str] = ("v_a",), held_out: float = 0.25) -> Dataset:
-    """A recording of the rig.
+    """A dataset of a recording of the rig.
 
     Args:
-        read: the recording. sensing: the measurement chain (model file). states, inputs: names to identify over.
+        read: the recording.
+        sensing: parameters of the measurement chain (model file).
+        states: names of the states.
+        inputs: names of the inputs.
         held_out: share at the end that models are not fitted to.
 
     Raises:
-        RecordingError: gaps, holes, missing or constant channels, too short; one line that says so.
+        RecordingError: the recording has gaps or holes, is too short, or a channel is missing or constant.
     """
     path = read.path
     for what, names, known in (("state", states, STATES), ("input", inputs, (*INPUTS, *STATES))):
         if len(set(names)) != len(names) or not names:
-            raise RecordingError(f"{path}: give at least one {what}, and each once; known: {', '.join(known)}")
+            raise RecordingError(f"{path}: give at least one {what}, and each only once; known: {', '.join(known)}")
         for name in names:
             if name not in known:
                 raise RecordingError(f"{path}: there is no {what} '{name}'; known: {', '.join(known)}")
     if both := set(states) & set(inputs):
         raise RecordingError(f"{path}: {', '.join(sorted(both))} cannot be both a state and an input")
     if "theta_dot" in inputs or ("theta_dot" in states and "theta" not in states):
-        raise RecordingError(f"{path}: theta_dot is not measured; give theta among the states, and theta_dot behind it")
+        raise RecordingError(f"{path}: theta_dot is not measured; give theta_dot as a state, beside theta")
     if read.duration < MINIMUM_DURATION:
-        raise RecordingError(f"{path}: {read.duration:.1f} s of samples; identification needs {MINIMUM_DURATION:g} s "
-                             "or more")
+        raise RecordingError(f"{path}: the recording has {read.duration:.1f} s; identification needs "
+                             f"{MINIMUM_DURATION:g} s or more")
     if len(read.gaps):
         at = int(read.gaps[0, 0])
         raise RecordingError(f"{path}: {read.lost} samples are missing in {len(read.gaps)} gaps, the first after "
-                             f"{read.t[at]:.3f} s; identification needs a recording without gaps, record again")
+                             f"{read.t[at]:.3f} s; identification needs a recording without gaps; record again")
     for name in (*states, *inputs):
         if name != "theta_dot":
             _check_channel(read, name)
@@ -176,7 +202,20 @@ def from_bag(read: Recording, sensing: Mapping[str, float], states: Sequence[str
 def from_readings(columns: Mapping[str, Array], period: float, sensing: Mapping[str, float],
                   states: Sequence[str] = STATES, inputs: Sequence[str] = ("v_a",), held_out: float = 0.25,
                   name: str = "readings") -> Dataset:
-    """As `from_bag`, from readings (N,) by channel name and `duty`, without a hole, every `period` seconds."""
+    """A dataset of readings of the rig, as `from_bag`.
+
+    Args:
+        columns: channel, or `duty` -> (N,) readings without holes.
+        period: [s] sample period.
+        sensing: parameters of the measurement chain (model file).
+        states: names of the states.
+        inputs: names of the inputs.
+        held_out: share at the end that models are not fitted to.
+        name: of the data, for messages.
+
+    Raises:
+        RecordingError: a channel cannot be used.
+    """
     signals = signals_from_arrays(columns, period, sensing, held_out, name)
     return _from_signals(name, signals, columns, sensing, states, inputs, held_out)
 
@@ -186,8 +225,8 @@ def _from_signals(name: str, signals: Signals, columns: Mapping[str, Array], sen
     for channel in (*states, *inputs):
         bad = float(np.mean(~np.isfinite(signals.channel(channel)))) if channel in CHANNELS else 0.0
         if bad > MOST_BAD:
-            raise RecordingError(f"{name}: {channel} cannot be used for {100.0 * bad:.0f} % of the time (clipped, "
-                                 "stuck or jumping readings); record again")
+            raise RecordingError(f"{name}: {100.0 * bad:.0f} % of the readings of {channel} cannot be used (clipped, "
+                                 "stuck or jumping); record again")
     n, h = len(signals), signals.period
     tau = sensing["angle_filter_tau"]
     noise = {"i_a": signals.sigma["i_a"], "theta": signals.sigma["theta"], "omega": signals.sigma["omega"]}
@@ -196,7 +235,7 @@ def _from_signals(name: str, signals: Signals, columns: Mapping[str, Array], sen
                                    "v_a": _held_voltage(columns["v_a"], signals.duty, signals.sigma["v_a"], h)}
     outputs: list[tuple[str, Output]] = []
     means: list[tuple[str, Means]] = []
-    chain: list[Link] = []
+    sensor_states: list[SensorState] = []
     smooth, rate = smoothed(columns["theta"], h)
     left = float(np.std(columns["theta"] - smooth))
     coarse["theta_dot"] = smoothness(columns["theta"])
@@ -205,8 +244,9 @@ def _from_signals(name: str, signals: Signals, columns: Mapping[str, Array], sen
     described |= {k: np.interp(late, np.arange(n), x) for k, x in (("theta", columns["theta"]), ("theta_dot", rate))}
     seen = "theta"
     if tau > 0.0 and "theta" in states:
-        chain += [Link("theta_stage1", {"theta": 1.0 / tau, "theta_stage1": -1.0 / tau}, "theta"),
-                  Link("theta_stage2", {"theta_stage1": 1.0 / tau, "theta_stage2": -1.0 / tau}, "theta")]
+        sensor_states += [
+            SensorState("theta_stage1", {"theta": 1.0 / tau, "theta_stage1": -1.0 / tau}, "theta"),
+            SensorState("theta_stage2", {"theta_stage1": 1.0 / tau, "theta_stage2": -1.0 / tau}, "theta")]
         seen = "theta_stage2"
     floor = {k: NUMERIC * float(np.nanstd(signals.channel(k))) for k in CHANNELS}
     described["omega"] = columns["omega"]
@@ -218,7 +258,7 @@ def _from_signals(name: str, signals: Signals, columns: Mapping[str, Array], sen
         coarse["omega"] = 2.0 * float(np.median(p.period[use])) / h
         noise["omega"] = float(np.sqrt(np.mean(np.diff(p.omega[use], 2) ** 2))) / 8.0
         if "omega" in states:
-            chain.append(Link("rotor_angle", {"omega": 1.0}))
+            sensor_states.append(SensorState("rotor_angle", {"omega": 1.0}))
             means.append(("rotor_angle", Means("omega", 0, p.time[use], p.period[use], p.omega[use], p.sigma[use])))
     for state in states:
         if state == "theta_dot" or (state == "omega" and means):
@@ -227,7 +267,7 @@ def _from_signals(name: str, signals: Signals, columns: Mapping[str, Array], sen
         outputs.append((seen if state == "theta" else state, Output(state, 0, signals.channel(state), sigma)))
     values = np.column_stack([described[s] for s in states])
     return Dataset(name, tuple(states), tuple(inputs), values, np.column_stack([described[u] for u in inputs]), h,
-                   tuple(outputs), tuple(means), tuple(chain), frozenset({"theta_dot"} & set(states)),
+                   tuple(outputs), tuple(means), tuple(sensor_states), frozenset({"theta_dot"} & set(states)),
                    noise=np.array([noise[k] for k in states]), coarse=np.array([coarse.get(k, 0.0) for k in states]),
                    train=_train(n, held_out), notes=signals.notes)
 
@@ -244,12 +284,7 @@ def _check_channel(read: Recording, name: str) -> None:
 
 
 def _held_voltage(v: Array, duty: Array, sigma: float, period: float) -> Array:
-    """The voltage (N,) without its noise: its mean while the duty is held, and what varies slowly beside it."""
+    """The voltage (N,) without its noise: its mean over each hold of the duty, plus its slow variation."""
     start, length = holds(duty)
     mean = np.repeat(np.add.reduceat(v, start) / length, length)
-    return np.asarray(mean + slow_part(v - mean, round(0.05 / period), sigma))
-
-
-def with_train(data: Dataset, held_out: float) -> Dataset:
-    """The same with another share held out."""
-    return replace(data, train=_train(len(data), held_out))
+    return np.asarray(mean + slow_part(v - mean, round(SLOW_VOLTAGE / period), sigma))

@@ -139,17 +139,17 @@ def identify_with_traces(data: Dataset, method: str = "weak", terms: Sequence[st
     show(0.05, "choosing terms by regression")
     regression = problem.regression()
     first = problem.regress(regression)
-    refined = None
+    selected = None
     if data.derivatives is None:
-        refined = problem.refine(first, show)
-        if refined is None:
+        selected = problem.select_terms(first, show)
+        if selected is None:
             raise RecordingError(f"{data.name}: the equations of the regression diverge when they are run, so there is "
                                  "no result; record longer, with more motion, or give fewer terms")
-        matrix, sigma = problem.narrowed(refined.matrix), problem.narrowed(refined.sigma)
+        matrix, sigma = problem.narrowed(selected.matrix), problem.narrowed(selected.sigma)
     else:
         matrix, sigma = first, problem.regression_sigma(regression, first)
-    held_out = problem.held_out_run(refined)
-    often = np.zeros(matrix.shape) if refined is None else problem.narrowed(refined.stability)
+    held_out = problem.held_out_run(selected)
+    often = np.zeros(matrix.shape) if selected is None else problem.narrowed(selected.stability)
     equations, spread, stability = (
         {s: {library[j]: float(values[k, j]) for j in np.flatnonzero(matrix[k])} for k, s in enumerate(data.states)}
         for values in (matrix, sigma, often))
@@ -157,14 +157,14 @@ def identify_with_traces(data: Dataset, method: str = "weak", terms: Sequence[st
         equations[data.states[k]] = dict(equation)
         spread[data.states[k]] = dict.fromkeys(equation, 0.0)
         stability[data.states[k]] = dict.fromkeys(equation, 1.0)
-    alternatives = () if refined is None else tuple(
-        Alternative(data.states[e], library[a], library[b], w) for e, a, b, w in refined.alternatives)
-    unstable = () if refined is None else tuple((data.states[e], library[t], o) for e, t, o in refined.unstable)
-    shots = 1 if refined is None else len(refined.fitter.parts)
+    alternatives = () if selected is None else tuple(
+        Alternative(data.states[e], library[a], library[b], w) for e, a, b, w in selected.alternatives)
+    unstable = () if selected is None else tuple((data.states[e], library[t], o) for e, t, o in selected.unstable)
+    shots = 1 if selected is None else len(selected.fitter.shots)
     measured, modelled = problem.derivative_traces(matrix)
     late = slice(data.train, None)
     mse = {s: float(np.mean((modelled - measured)[late, k] ** 2)) for k, s in enumerate(data.states)}
-    found = Identified(method, tuple(library), equations, spread, {} if refined is None else stability, unstable,
+    found = Identified(method, tuple(library), equations, spread, {} if selected is None else stability, unstable,
                        alternatives, mse, held_out.channels, shots, time.perf_counter() - started,
                        (*data.notes, *held_out.notes))
     return found, Traces(measured, modelled, held_out.states)

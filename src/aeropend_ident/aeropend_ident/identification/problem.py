@@ -16,9 +16,9 @@ from aeropend_ident.identification import dataset
 from aeropend_ident.identification.dataset import Dataset
 from aeropend_ident.identification.discrepancy import Equations
 from aeropend_ident.identification.output_error import Entries, Experiment, Fitter
-from aeropend_ident.identification.output_error_selection import MOST, Refined, follows, refine
+from aeropend_ident.identification.output_error_selection import MOST, SelectedModel, select_terms, tracks
 from aeropend_ident.identification.sindy import Regression, regress
-from aeropend_ident.identification.subset_selection import Sums, select
+from aeropend_ident.identification.subset_selection import NormalEquations, ebic_search
 from aeropend_ident.identification.terms import Array, Library
 from aeropend_ident.identification.weak import NUMERIC, Weak, half_width, sided
 from aeropend_sim.cli.progress import Show, nothing
@@ -95,10 +95,11 @@ class Problem:
                 fixed.setdefault(data.states.index(s), {}).update(equation)
         self.exact = exact if known is None else {k: {} for k in exact}
         self._known = fixed
-        fixed = {**fixed, **{n + k: dict(link.rate) for k, link in enumerate(data.chain)}}
+        fixed = {**fixed, **{n + k: dict(sensor.rate) for k, sensor in enumerate(data.sensor_states)}}
         extra = list(dict.fromkeys(t for e in fixed.values() for t in e if t not in names))
-        self.library = Library.of((*data.states, *(link.name for link in data.chain), *data.inputs), [*names, *extra])
-        self._fixed_matrix = np.zeros((n + len(data.chain), len(self.library)))
+        sensors = (sensor.name for sensor in data.sensor_states)
+        self.library = Library.of((*data.states, *sensors, *data.inputs), [*names, *extra])
+        self._fixed_matrix = np.zeros((n + len(data.sensor_states), len(self.library)))
         for e, equation in fixed.items():
             for t, c in equation.items():
                 self._fixed_matrix[e, self.library.names.index(t)] = c
@@ -134,7 +135,7 @@ class Problem:
             s = np.flatnonzero(matrix[k])
             if len(s):
                 known = self._known_rate(k, d.values[: d.train], d.held[: d.train], mean=False)
-                sums = Sums.total(regression.blocks(k, matrix[k], known))
+                sums = NormalEquations.total(regression.blocks(k, matrix[k], known))
                 variance = sums.misfit(matrix[k]) / max(sums.n - len(s), 1.0)
                 out[k, s] = np.sqrt(variance * np.diag(np.linalg.pinv(sums.H[np.ix_(s, s)], hermitian=True)))
         return out
@@ -172,7 +173,7 @@ class Problem:
 
     def rows(self, names: Sequence[str]) -> list[int]:
         """The rows of states in a wide matrix; the states of the measurement chain have rows, too."""
-        every = [*self.data.states, *(link.name for link in self.data.chain)]
+        every = [*self.data.states, *(sensor.name for sensor in self.data.sensor_states)]
         return [every.index(s) for s in names]
 
     # --- free runs
@@ -188,14 +189,14 @@ class Problem:
         d = self.data
         values = d.values[:stop] if described is None else described
         group = list(group) or list(d.states)
-        near = {*group, *(link.name for link in d.chain if link.follows in group)}
-        links = [link for link in d.chain if near & set(link.rate)]
-        running = [*group, *(link.name for link in links)]
+        near = {*group, *(sensor.name for sensor in d.sensor_states if sensor.starts_as in group)}
+        running_sensors = [sensor for sensor in d.sensor_states if near & set(sensor.rate)]
+        running = [*group, *(sensor.name for sensor in running_sensors)]
         other = [k for k, s in enumerate(d.states) if s not in group]
-        idle = [link.name for link in d.chain if link not in links]
+        idle = [sensor.name for sensor in d.sensor_states if sensor not in running_sensors]
         library = Library.of((*running, *(d.states[k] for k in other), *idle, *d.inputs), self.library.names)
         at = {name: k for k, name in enumerate(running)}
-        start_of = tuple(at[link.follows] if link.follows else -1 for link in links)
+        start_of = tuple(at[sensor.starts_as] if sensor.starts_as else -1 for sensor in running_sensors)
         own = values[:, self.rows(group)]
         guess = np.column_stack([own, *(own[:, f] if f >= 0 else np.zeros(stop) for f in start_of)])
         between = values[:, other]
@@ -207,7 +208,7 @@ class Problem:
                            means, Entries.of(self._fixed_matrix[self.rows(running)]), len(group), start_of)
         return whole.part(0, stop)
 
-    def refine(self, first: Array, show: Show = nothing) -> Refined | None:
+    def select_terms(self, first: Array, show: Show = nothing) -> SelectedModel | None:
         """Terms and coefficients by free runs, from a first matrix.
 
         Where the first model does not track the recording, each group of states is first run alone, with the other
@@ -225,12 +226,13 @@ class Problem:
         whole = self.experiment(d.train)
         show(0.1, "fitting free runs")
         fitter = Fitter(whole, Entries.of(start), 0, floor=1.0)
-        if not (fitter.fit(rounds=15) and follows(fitter)):
-            better = self._refine_groups(start.copy(), shot)
+        if not (fitter.fit(rounds=15) and tracks(fitter)):
+            better = self._select_by_groups(start.copy(), shot)
             fitter = Fitter(whole, Entries.of(better), 0, floor=1.0)
-            if d.chain or (fitter.fit(rounds=15) and follows(fitter)):
-                return refine(whole, better, self.candidates, shot, follow=False, score=self.held_out_misfit, show=show)
-        return refine(whole, start, self.candidates, shot, score=self.held_out_misfit, show=show)
+            if d.sensor_states or (fitter.fit(rounds=15) and tracks(fitter)):
+                return select_terms(whole, better, self.candidates, shot, cut=False, score=self.held_out_misfit,
+                                    show=show)
+        return select_terms(whole, start, self.candidates, shot, score=self.held_out_misfit, show=show)
 
     def _shortest_shot(self) -> int:
         """Samples of the shortest shots: the width of the widest test function."""
@@ -243,8 +245,8 @@ class Problem:
         rates = {s + dataset.RATE for s in d.states} & set(d.states)
         return [[s, s + dataset.RATE] if s + dataset.RATE in rates else [s] for s in d.states if s not in rates]
 
-    def _refine_groups(self, start: Array, shot: int) -> Array:
-        """Refine the groups of states one at a time; each run then gives a better description of its states.
+    def _select_by_groups(self, start: Array, shot: int) -> Array:
+        """Choose the terms of each group of states alone; its run then gives a better description of its states.
 
         Args:
             start: (wide) first coefficients; they are replaced.
@@ -264,9 +266,9 @@ class Problem:
                     (self.widened(self._regress_steps(group[0], most, described)) for most in (5, 3, 2)
                      if len(group) == 1))
                 for trial in tries:
-                    found = refine(experiment, trial[rows], self.candidates[rows], shot, follow=False)
+                    found = select_terms(experiment, trial[rows], self.candidates[rows], shot, cut=False)
                     left = np.inf if found is None else max(found.fitter.scale.values())
-                    if found is not None and follows(found.fitter) and left < size.get(group[0], np.inf):
+                    if found is not None and tracks(found.fitter) and left < size.get(group[0], np.inf):
                         size[group[0]] = left
                         start[rows] = found.matrix
                         states = found.fitter.run(*found.fitter.point)
@@ -321,8 +323,8 @@ class Problem:
         between = 0.5 * (described[:-1] + described[1:])  # states are not held: mean over a sample
         terms = self._narrow(np.column_stack([between, d.held[: d.train][:-1]]))[:, [*own, *others]]
         terms[:, 0] = described[:-1, k]
-        sums = Sums.of(terms, described[1:, k])
-        chosen = sums.solve(sorted({0, *select(sums, most)}))
+        sums = NormalEquations.of(terms, described[1:, k])
+        chosen = sums.solve(sorted({0, *ebic_search(sums, most)}))
         a = float(np.clip(chosen[0], 1e-6, 1.0 - 1e-6))
         rate = math.log(a) / d.period
         matrix[k, [*own, *others]] = chosen * rate / (a - 1.0)
@@ -331,15 +333,15 @@ class Problem:
 
     # --- held-out data
 
-    def held_out_run(self, refined: Refined | None) -> HeldOutRun:
+    def held_out_run(self, selected: SelectedModel | None) -> HeldOutRun:
         """Run the model freely from the start of the recording, and compare it with the readings held out."""
         d = self.data
-        if refined is None or d.train >= len(d):
+        if selected is None or d.train >= len(d):
             return HeldOutRun({}, None, ())
-        if (shots := len(refined.fitter.parts)) > 1:
+        if (shots := len(selected.fitter.shots)) > 1:
             note = f"the recording was run in {shots} shots: a free run over all of it does not stay with the readings"
             return HeldOutRun({}, None, (note,))
-        run = self._run_on(refined.fitter)
+        run = self._run_on(selected.fitter)
         if run is None:
             return HeldOutRun({}, None, ("the equations diverge on the held-out data",))
         found = {c: FreeRun(float(np.sqrt(np.mean(left**2))), float(np.sqrt(np.mean(sigma**2))))
@@ -361,7 +363,7 @@ class Problem:
 
     def _run_on(self, fitted: Fitter) -> tuple[Fitter, list[Array]] | None:
         """Run a fitted model over the whole recording; None with several shots, or with nothing held out."""
-        if len(fitted.parts) > 1 or self.data.train >= len(self.data):
+        if len(fitted.shots) > 1 or self.data.train >= len(self.data):
             return None
         fitter = Fitter(self.experiment(len(self.data)), fitted.model, 0)
         fitter.steps = fitted.steps

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which of many candidate terms a regression needs: one automatic rule, on its normal equations.
+"""Selection of the terms of a linear regression: one automatic rule, on its normal equations.
 
-A term stays when the misfit would grow by more than the extended Bayesian criterion asks (Chen & Chen, Biometrika 95,
-2008): ln n for every number, and 2 ln p for having been chosen among p. Everything works on sums over the data.
+A term stays if the misfit without it would grow by more than the penalty of the extended Bayesian information criterion
+(EBIC; Chen & Chen, Biometrika 95, 2008): ln n for each coefficient, and 2 ln p for the choice among p candidates.
+
+The search adds, drops and exchanges single terms. One inverse rates all neighbours of a support, by the Schur
+complement of each further term. Free runs (`output_error_selection`) use the same search on their linearised misfit.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -18,51 +21,64 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 ROUNDING = 1e-11
-"""Share of the sum of squares below which a misfit is rounding."""
+"""Share of the sum of squares below which a misfit is rounding. Choice: the precision of a double times 10^5 rows."""
 
 EXHAUSTIVE, MOST_SUPPORTS = 3, 50_000
-"""Supports of up to so many terms are all tried, if they are no more than that."""
+"""All supports of up to EXHAUSTIVE terms are tried, unless there are more than MOST_SUPPORTS of one size. Choice: this
+takes less than a second."""
 
 SINGULAR = 1e-9
-"""What keeps two terms that are the same from looking like a good support."""
+"""Added to the diagonal of small scaled systems: two equal terms then do not look like a good support. Choice."""
 
 RIDGE = 1e-13
-"""Added to sums scaled to 1, so that terms that are the same do no harm."""
+"""Added to the diagonal of scaled systems, so that equal terms do not make them singular. Choice: near rounding."""
+
+DEPENDENT = 1e-9
+"""Schur complement of a scaled term below which it is a linear combination of the support's terms. Choice."""
+
+LEAST_GAIN = 1e-6
+"""Decrease of the criterion below which a change is rounding. Choice."""
+
+MOST_CHANGES = 96
+"""Greatest number of changes in one search. Choice: 8 for each of 12 terms; guards against cycles by rounding."""
 
 
 @dataclass(frozen=True)
-class Sums:
-    """A linear regression, summed over its rows.
+class NormalEquations:
+    """A linear regression y = Θ c, as sums over its rows.
 
     Attributes:
-        H: (P, P) Θ'Θ. g: (P,) Θ'y. y2: y'y. n: independent rows.
-        whole: y'y of what y is a part of, where something known was taken off; its rounding is in y.
+        H: (P, P) Θ'Θ.
+        g: (P,) Θ'y.
+        y2: y'y.
+        n: number of independent rows.
+        total2: y'y before a known part was subtracted from y; rounding is relative to it.
     """
 
     H: Array
     g: Array
     y2: float
     n: float
-    whole: float
+    total2: float
 
     @classmethod
-    def of(cls, rows: Array, y: Array, known: Array | None = None) -> Sums:
-        """The sums of rows (N, P) and y (N,), from which `known` (N,) was taken off."""
-        whole = y if known is None else y + known
-        return cls(rows.T @ rows, rows.T @ y, float(y @ y), float(len(y)), float(whole @ whole))
+    def of(cls, rows: Array, y: Array, known: Array | None = None) -> NormalEquations:
+        """Sum up rows (N, P) and y (N,), from which `known` (N,) was subtracted."""
+        total = y if known is None else y + known
+        return cls(rows.T @ rows, rows.T @ y, float(y @ y), float(len(y)), float(total @ total))
 
     @classmethod
-    def total(cls, blocks: Sequence[Sums]) -> Sums:
-        """Several added up."""
+    def total(cls, blocks: Sequence[NormalEquations]) -> NormalEquations:
+        """The sum of several blocks of rows."""
         return cls(np.sum([b.H for b in blocks], axis=0), np.sum([b.g for b in blocks], axis=0),
-                   *(sum(getattr(b, k) for b in blocks) for k in ("y2", "n", "whole")))
+                   *(sum(getattr(b, k) for b in blocks) for k in ("y2", "n", "total2")))
 
-    def times(self, share: float) -> Sums:
-        """The same with every row counted as `share` of one."""
-        return Sums(share * self.H, share * self.g, share * self.y2, share * self.n, share * self.whole)
+    def times(self, share: float) -> NormalEquations:
+        """The same, where each row has the weight `share`."""
+        return NormalEquations(share * self.H, share * self.g, share * self.y2, share * self.n, share * self.total2)
 
     def solve(self, support: Sequence[int]) -> Array:
-        """The coefficients (P,) of least squares over a support, 0 elsewhere."""
+        """The least-squares coefficients (P,) over a support, 0 elsewhere."""
         c = np.zeros(len(self.g))
         s = list(support)
         if s:
@@ -71,41 +87,47 @@ class Sums:
         return c
 
     def misfit(self, c: Array) -> float:
-        """Sum of squares that coefficients (P,) leave."""
+        """The sum of squares of the residuals with coefficients c (P,)."""
         return max(float(self.y2 - 2.0 * c @ self.g + c @ self.H @ c), 0.0)
 
 
-def price(n: float, candidates: int) -> float:
-    """What a term must take off the misfit, in units of the noise's variance."""
+def ebic_penalty(n: float, candidates: int) -> float:
+    """Decrease of the misfit, in units of the noise's variance, that a term needs to be chosen.
+
+    Args:
+        n: number of independent rows.
+        candidates: number of candidate terms.
+    """
     return float(np.log(max(n, 2.0)) + 2.0 * np.log(max(candidates, 1)))
 
 
-def select(sums: Sums, most: int = 12) -> list[int]:
-    """The support that the criterion prefers.
+def ebic_search(equations: NormalEquations, most: int = 12) -> list[int]:
+    """The support with the lowest criterion.
 
-    Found by steps of adding, dropping and exchanging a term, from nothing, from what is left when terms are dropped
-    from all of them, and from the best of all small supports: the steps alone do not leave a group of terms that
-    together stand in for one.
+    The search starts from no terms, from all terms after the least needed were dropped, and from the best of all small
+    supports: single changes do not leave a group of terms that together replace one.
 
     Args:
-        sums: the regression. most: terms at most.
+        equations: the regression.
+        most: greatest number of terms.
     """
-    search = _Search(sums, most)
+    search = _Regression(equations, most)
     left = list(search.usable)
     while len(left) > most:
-        left = search.drop(left)[0]
-    starts = [[], left, *([search.usable[j] for j in s] for s in smallest(
+        left = list(search.drop(left).support)
+    starts = [[], left, *([search.usable[j] for j in s] for s in best_small_supports(
         search.H[np.ix_(search.usable, search.usable)], search.g[search.usable]))]
-    found = [search.descend(s) for s in starts]
-    rated = [(search.rate(len(s), search.misfit(s)), s) for s in found]
+    found = [descend(s, search.rate(s), search.single_changes, search.exchanges) for s in starts]
+    rated = [(search.rate(s), s) for s in found]
     return sorted(min(rated)[1])
 
 
-def smallest(H: Array, g: Array) -> list[list[int]]:
-    """For every small number of terms the support that takes most off, of all there are.
+def best_small_supports(H: Array, g: Array) -> list[list[int]]:
+    """The best of all supports of one term, of two terms and so on, up to `EXHAUSTIVE`.
 
     Args:
-        H: (P, P) sums, scaled to a diagonal of 1 or less. g: (P,).
+        H: (P, P) normal matrix, scaled to a diagonal of at most 1.
+        g: (P,) right-hand side.
     """
     found = []
     for size in range(1, EXHAUSTIVE + 1):
@@ -119,65 +141,109 @@ def smallest(H: Array, g: Array) -> list[list[int]]:
     return found
 
 
-class _Search:
-    """Steps between supports, every neighbour of a support rated from one inverse."""
+@dataclass(frozen=True, order=True)
+class Change:
+    """A changed support and its criterion; the lower criterion is less, then the support that comes first."""
 
-    def __init__(self, sums: Sums, most: int) -> None:
-        size = np.diag(sums.H)
+    value: float
+    support: tuple[int, ...]
+
+
+def descend(support: list[int], value: float, single_changes: Callable[[list[int]], Iterable[Change]],
+            exchanges: Callable[[list[int]], Iterable[Change]]) -> list[int]:
+    """Add, drop and exchange terms while the criterion decreases.
+
+    Args:
+        support: where to start.
+        value: its criterion.
+        single_changes: gives the best addition and the best removal.
+        exchanges: gives the best replacement of each term; asked where no single change helps.
+    """
+    for _ in range(MOST_CHANGES):
+        found = min(single_changes(support), default=None)
+        if found is None or found.value > value - LEAST_GAIN:
+            found = min(exchanges(support), default=None)
+        if found is None or found.value > value - LEAST_GAIN:
+            break
+        support, value = list(found.support), found.value
+    return support
+
+
+def addition_gains(H: Array, g: Array, support: list[int], inverse: Array, solution: Array) -> Array:
+    """Decrease (P,) of the misfit by each further term.
+
+    It is the square of the term's remaining right-hand side over its Schur complement.
+
+    Args:
+        H: (P, P) normal matrix, scaled to a diagonal of at most 1.
+        g: (P,) right-hand side.
+        support: terms that are in the model.
+        inverse: of H over the support.
+        solution: over the support.
+
+    Returns:
+        -1 for linear combinations of the support's terms; values at the support itself mean nothing.
+    """
+    cross = H[:, support]
+    size = np.diag(H) - np.einsum("ij,jk,ik->i", cross, inverse, cross)
+    return np.where(size > DEPENDENT, (g - cross @ solution) ** 2 / np.maximum(size, DEPENDENT), -1.0)
+
+
+class _Regression:
+    """Criterion and neighbours of the supports of a regression whose noise variance is unknown."""
+
+    def __init__(self, equations: NormalEquations, most: int) -> None:
+        size = np.diag(equations.H)
         self.usable = [int(j) for j in np.flatnonzero(size > 0.0)]
         d = np.where(size > 0.0, 1.0 / np.sqrt(np.maximum(size, 1e-300)), 0.0)
-        self.H, self.g, self.sums, self.most = d[:, None] * sums.H * d, d * sums.g, sums, most
+        self.H, self.g = d[:, None] * equations.H * d, d * equations.g
+        self._equations, self._most = equations, most
 
-    def rate(self, terms: int, misfit: float) -> float:
-        """The criterion of so many terms that leave so much."""
-        s = self.sums
-        left = max(misfit, ROUNDING * s.whole, 1e-300)
-        return s.n * float(np.log(left / s.n)) + terms * price(s.n, len(self.g))
+    def rate(self, support: list[int]) -> float:
+        """The criterion of a support."""
+        return self._criterion(len(support), self._misfit(support, self._inverse(support) @ self.g[support]))
 
-    def inverse(self, support: list[int]) -> Array:
-        """Of the sums over a support."""
+    def _criterion(self, terms: int, misfit: float) -> float:
+        e = self._equations
+        left = max(misfit, ROUNDING * e.total2, 1e-300)
+        return e.n * float(np.log(left / e.n)) + terms * ebic_penalty(e.n, len(self.g))
+
+    def _inverse(self, support: list[int]) -> Array:
         return np.asarray(np.linalg.inv(self.H[np.ix_(support, support)] + RIDGE * np.eye(len(support))))
 
-    def misfit(self, support: list[int]) -> float:
-        """What a support leaves."""
-        return self.left(support, self.inverse(support) @ self.g[support])
+    def _misfit(self, support: list[int], c: Array) -> float:
+        """Misfit with coefficients c; an error of theirs counts in second order only."""
+        return float(self._equations.y2 - 2.0 * c @ self.g[support] + c @ self.H[np.ix_(support, support)] @ c)
 
-    def left(self, support: list[int], c: Array) -> float:
-        """What coefficients leave; an error in them counts in the second order only."""
-        return float(self.sums.y2 - 2.0 * c @ self.g[support] + c @ self.H[np.ix_(support, support)] @ c)
-
-    def drop(self, support: list[int]) -> tuple[list[int], float]:
-        """The support without the term that it misses least, and what that leaves."""
-        inverse = self.inverse(support)
+    def drop(self, support: list[int]) -> Change:
+        """Drop the term that is needed least."""
+        inverse = self._inverse(support)
         c = inverse @ self.g[support]
         loss = c**2 / np.diag(inverse)
         j = int(np.argmin(loss))
-        return support[:j] + support[j + 1:], self.left(support, c) + float(loss[j])
+        misfit = self._misfit(support, c) + float(loss[j])
+        return Change(self._criterion(len(support) - 1, misfit), (*support[:j], *support[j + 1:]))
 
-    def add(self, support: list[int], barred: int = -1) -> tuple[list[int], float]:
-        """The support and the term that takes most off, and what that leaves."""
-        inverse = self.inverse(support)
-        cross = self.H[:, support]
+    def _add(self, support: list[int], barred: int = -1) -> Change:
+        """Add the term that lowers the misfit most, but not `barred`."""
+        inverse = self._inverse(support)
         c = inverse @ self.g[support]
-        size = np.diag(self.H) - np.einsum("ij,jk,ik->i", cross, inverse, cross)
-        gain = np.where(size > 1e-9, (self.g - cross @ c) ** 2 / np.maximum(size, 1e-9), -1.0)
+        gain = addition_gains(self.H, self.g, support, inverse, c)
         gain[support] = -1.0
         if barred >= 0:
             gain[barred] = -1.0
         j = int(np.argmax(gain))
-        return [*support, j], self.left(support, c) - max(float(gain[j]), 0.0)
+        misfit = self._misfit(support, c) - max(float(gain[j]), 0.0)
+        return Change(self._criterion(len(support) + 1, misfit), (*support, j))
 
-    def descend(self, support: list[int]) -> list[int]:
-        """Step while it pays."""
-        value = self.rate(len(support), self.misfit(support))
-        while True:
-            moves = [self.drop(support)] if support else []
-            if len(support) < min(self.most, len(self.usable)):
-                moves.append(self.add(support))
-            rated = [(self.rate(len(s), left), s) for s, left in moves]
-            if not rated or min(rated)[0] > value - 1e-6:
-                rated = [(self.rate(len(support), left), s) for s, left in (
-                    self.add(support[:j] + support[j + 1:], support[j]) for j in range(len(support)))]
-            if not rated or min(rated)[0] > value - 1e-6:
-                return support
-            value, support = min(rated)
+    def single_changes(self, support: list[int]) -> Iterator[Change]:
+        """The best removal and the best addition."""
+        if support:
+            yield self.drop(support)
+        if len(support) < min(self._most, len(self.usable)):
+            yield self._add(support)
+
+    def exchanges(self, support: list[int]) -> Iterator[Change]:
+        """For each term the best other term in its place."""
+        for j in range(len(support)):
+            yield self._add([*support[:j], *support[j + 1:]], support[j])

@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The weak form: derivatives moved from the data to smooth test functions (Messenger & Bortz, 2021).
+"""The weak form: derivatives are moved from the data to smooth test functions.
+
+Weak SINDy: Messenger & Bortz, Multiscale Modeling & Simulation 19, 2021.
 
 ∫ -φ' x dt = Σ c ∫ φ f(x, u) dt for test functions φ = (1 - s²)^p of compact support. Over such a function the
-trapezoidal rule is exact to high order for smooth f. Where a held input steps, the two sides of the step are averaged,
-so that the step costs no accuracy, and what is not smooth is cut: sides differ only in the input.
+trapezoidal rule is exact to high order for smooth f. Where a held input steps, the mean of the terms on both sides of
+the step is used, so that the step costs no accuracy.
 
-How wide the functions are follows from the spectrum: they pass what stands out of the noise and no more. Their
-overlap, and the noise inside the terms, correlate the rows; these are whitened (generalised least squares; the noise
-inside the terms as in Bortz, Messenger & Dukic, WENDy, 2023).
+The width of the functions follows from the spectrum: they pass the frequencies at which the signal exceeds the noise.
+Their overlap, and the noise inside the terms, correlate the rows. So the rows are whitened (generalised least squares;
+noise inside the terms as in WENDy: Bortz, Messenger & Dukic, Bulletin of Mathematical Biology 85, 2023).
+
+The weak form of a free decay in `diagnosis.chain.nominal_fit` is another problem: of second order, with three fixed
+terms and windows of fixed length. The two share no code.
 """
 
 from __future__ import annotations
@@ -19,26 +24,42 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cholesky_banded, solve_banded
 
-from aeropend_ident.identification.subset_selection import Sums
+from aeropend_ident.identification.subset_selection import NormalEquations
 from aeropend_ident.identification.terms import Array, Library
 from aeropend_ident.signals.derivatives import noise_of
 
 P = 8
-"""Power of the test functions: that many derivatives vanish at the ends."""
+"""Power of the test functions: the function and its first P - 1 derivatives are 0 at the ends. Choice."""
 
 NARROWEST, OVERLAP = 12, 4
-"""Least half-width in samples, and test functions that cover a sample, over two."""
+"""Least half-width in samples, and half the number of test functions that cover a sample. Choice."""
 
 NUMERIC = 1e-5
-"""Share of a signal's spread that sampling it costs, however little noise there is (100 dB)."""
+"""Least noise of a signal over its standard deviation, for errors of sampling and integration. Choice: -100 dB."""
 
 BLOCKS = 24
-"""Parts of the data that are resampled."""
+"""Number of blocks of rows. Choice."""
+
+ABOVE_NOISE = 3.0
+"""Power of a signal over that of its noise from which on it exceeds the noise. Choice."""
+
+NOISE_BAND = 0.7
+"""Share of the spectrum above which it is noise. Choice."""
+
+WIDEST = 20
+"""A window is no wider than the recording's length over this. Choice."""
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Test functions on a grid: half-width m (samples), first sample of each (K,), values and slopes (2m + 1,)."""
+    """Test functions on a grid.
+
+    Attributes:
+        half: half-width m in samples.
+        first: (K,) first sample of each.
+        phi: (2m + 1,) values.
+        slope: [1/s] (2m + 1,) derivatives.
+    """
 
     half: int
     first: NDArray[np.int64]
@@ -47,13 +68,18 @@ class Windows:
 
     @classmethod
     def over(cls, n: int, half: int, period: float) -> Windows:
-        """Windows of half-width `half` over n samples, overlapping; area 1.
+        """Overlapping test functions of area 1.
+
+        Args:
+            n: number of samples.
+            half: half-width in samples.
+            period: [s] sample period.
 
         Raises:
             ValueError: there are fewer samples than a window has.
         """
         if n < 2 * half + 1:
-            raise ValueError(f"{n} samples are fewer than a window of {2 * half + 1}")
+            raise ValueError(f"{n} samples are fewer than the {2 * half + 1} of a window")
         s = np.arange(-half, half + 1) / half
         phi = (1.0 - s * s) ** P
         slope = -2.0 * P * s * (1.0 - s * s) ** (P - 1) / (half * period)
@@ -70,26 +96,32 @@ class Windows:
 
 
 def corner(x: Array) -> float:
-    """Frequency (cycles a sample) above which noise hides a signal (N,); ½ where it never does."""
+    """[cycles per sample] Frequency above which noise hides a signal (N,); 0.5 if it hides it nowhere."""
     n = len(x)
     ramp = np.linspace(x[0], x[-1], n)
     power = np.abs(np.fft.rfft((x - ramp) * np.hanning(n))) ** 2
     bins = np.unique(np.geomspace(1, len(power), 60).astype(int))
     mean = np.array([power[a:b].mean() for a, b in pairwise(bins)])
-    floor = float(np.median(power[int(0.7 * len(power)):]))
+    floor = float(np.median(power[int(NOISE_BAND * len(power)):]))
     if floor <= 1e-18 * power.max():
         return 0.5
-    over = np.flatnonzero(mean > 3.0 * floor)
+    over = np.flatnonzero(mean > ABOVE_NOISE * floor)
     return float(0.5 * bins[over[-1] + 1] / len(power)) if len(over) else 1.0 / n
 
 
 def half_width(x: Array) -> int:
-    """Half-width (samples) of the windows that a signal (N,) passes."""
+    """Half-width in samples of the test functions that pass a signal (N,) up to its `corner`."""
     return max(NARROWEST, round(1.5 * float(np.sqrt(2 * P + 3.0)) / (2.0 * np.pi * corner(x))))
 
 
 def sided(library: Library, states: Array, inputs: Array) -> Array:
-    """Terms (N, terms) at the samples, the mean of both sides of a step of the held inputs."""
+    """Terms (N, terms) at the samples; where a held input steps, the mean of both sides.
+
+    Args:
+        library: the terms.
+        states: (N, S).
+        inputs: (N, U), held from sample to sample.
+    """
     now = library(np.column_stack([states, inputs]))
     if inputs.shape[1] == 0:
         return now
@@ -98,54 +130,60 @@ def sided(library: Library, states: Array, inputs: Array) -> Array:
 
 
 class Weak:
-    """The weak form of a recording over a library, every equation with windows of its own width.
-
-    Args:
-        library: terms over states and inputs. states: (N, S). inputs: (N, U), held. period: s.
-        noise: (S,) standard deviation of the states; None: as they show it.
-        coarse: (S,) samples over which a description of a state is smooth by making; no window is narrower.
-    """
+    """The weak form of a recording over a library; each equation has test functions of its own width."""
 
     def __init__(self, library: Library, states: Array, inputs: Array, period: float, noise: Array | None = None,
                  coarse: Array | None = None) -> None:
+        """Evaluate the terms, and choose the widths.
+
+        Args:
+            library: terms over states and inputs.
+            states: (N, S).
+            inputs: (N, U), held from sample to sample.
+            period: [s] sample period.
+            noise: (S,) standard deviation of the noise of the states; None: estimated from them.
+            coarse: (S,) number of samples over which a state was smoothed; no window is narrower.
+        """
         self.library, self.states, self.inputs, self.period = library, states, inputs, period
         coarse = np.zeros(states.shape[1]) if coarse is None else coarse
-        widest = max(len(states) // 20, NARROWEST)
+        widest = max(len(states) // WIDEST, NARROWEST)
         self.halves = [int(min(max(half_width(x), c), widest)) for x, c in zip(states.T, coarse)]
         self.terms = sided(library, states, inputs)
         self.noise = np.hypot(noise_of(states) if noise is None else noise, NUMERIC * states.std(axis=0))
         self._windows: dict[int, tuple[Windows, Array]] = {}
 
     def windows(self, equation: int) -> tuple[Windows, Array]:
-        """The windows of an equation, and the terms (K, terms) in them."""
+        """The test functions of an equation, and the terms (K, terms) integrated over them."""
         half = self.halves[equation]
         if half not in self._windows:
             windows = Windows.over(len(self.states), half, self.period)
             self._windows[half] = windows, windows.project(self.terms, windows.phi) * self.period
         return self._windows[half]
 
-    def blocks(self, equation: int, coefficients: Array | None = None, known: Array | None = None) -> list[Sums]:
-        """The whitened regression of one equation in blocks of time.
+    def blocks(self, equation: int, coefficients: Array | None = None, known: Array | None = None
+               ) -> list[NormalEquations]:
+        """The whitened regression of one equation, in blocks of time.
 
         Args:
-            equation: index of the state. coefficients: (terms,) present estimate, for the noise inside the terms.
-            known: (N,) part of the derivative that is known (discrepancy).
+            equation: index of the state.
+            coefficients: (terms,) present estimate, for the noise inside the terms.
+            known: (N,) known part of the derivative (discrepancy).
         """
         windows, right = self.windows(equation)
         left = -windows.project(self.states[:, equation], windows.slope) * self.period
         off = np.zeros(len(left)) if known is None else windows.project(known, windows.phi) * self.period
         rows = self._whiten(np.column_stack([right, left - off, off]), equation, coefficients)
         parts = np.array_split(rows, min(BLOCKS, max(1, len(rows) // 8)))
-        return [Sums.of(p[:, :-2], p[:, -2], p[:, -1]) for p in parts]
+        return [NormalEquations.of(p[:, :-2], p[:, -2], p[:, -1]) for p in parts]
 
     def _whiten(self, rows: Array, equation: int, coefficients: Array | None) -> Array:
-        """Divide by a root of the rows' covariance: noise of the state under φ', and of all states inside the terms."""
+        """Divide rows by a root of their covariance: noise of the state with φ', and of all states inside the terms."""
         w, _ = self.windows(equation)
         step = int(w.first[1] - w.first[0]) if len(w.first) > 1 else 1
         K, length = len(rows), len(w.phi)
         lags = min(K - 1, (length - 1) // step)
         band = np.zeros((lags + 1, K))
-        # a residual is left - right: the noise of state j enters it with the weights -φ' (its own) - φ ∂f/∂x_j
+        # a residual is left - right: the noise of state j enters with weights -φ ∂f/∂x_j, and -φ' if it is its own
         slopes = np.zeros((len(self.states), self.states.shape[1]))
         if coefficients is not None and np.any(coefficients):
             slopes = self._slopes(coefficients)
@@ -169,7 +207,7 @@ class Weak:
         return np.asarray(solve_banded((lags, 0), root, rows))
 
     def _slopes(self, coefficients: Array) -> Array:
-        """Derivative (N, S) of the right-hand side by each state, from differences."""
+        """Derivatives (N, S) of the right-hand side by the states, by central differences."""
         used = np.flatnonzero(coefficients)
         small = Library.of(self.library.variables, [self.library.names[j] for j in used])
         out = np.empty_like(self.states)
