@@ -19,7 +19,18 @@ from rich.table import Table
 
 from aeropend_sim.cli.command import Parser
 from evaluation import results
-from evaluation.benchmarks import bags, control, growth, hardware, history, identification, nodes, readme, simulation
+from evaluation.benchmarks import (
+    bags,
+    control,
+    estimation,
+    growth,
+    hardware,
+    history,
+    identification,
+    nodes,
+    readme,
+    simulation,
+)
 from evaluation.benchmarks.measure import Figure, NotMeasuredError, Spread, load, number
 from evaluation.support.graph import isolate
 
@@ -40,6 +51,7 @@ FIGURES: dict[str, Callable[[bool], list[Figure]]] = {
     "sparse-rig": identification.chain,
     "sparse-lorenz": identification.study,
     "sparse-speed": identification.speed,
+    "optimiser": estimation.optimiser,
     "plant": nodes.plant,
     "record": nodes.record,
     "emulator": hardware.emulator,
