@@ -48,7 +48,19 @@ def signals_of(bag: str | Path, namespace: str | None, sensing: Mapping[str, flo
     Raises:
         RecordingError: no verdict is possible; one line that says why.
     """
-    read = recording.read(bag, namespace)
+    return as_signals(recording.read(bag, namespace), sensing, held_out, fit_nominal=fit_nominal)
+
+
+def as_signals(read: Recording, sensing: Mapping[str, float], held_out: float = 0.3, *, fit_nominal: bool = False
+               ) -> Signals:
+    """A recording as signals; arguments and errors as for `signals_of`.
+
+    Args:
+        read: the recording.
+        sensing: parameters of the model's measurement chain.
+        held_out: share of the recording at its end that models are not fitted to.
+        fit_nominal: whether the rig is uncalibrated.
+    """
     if not fit_nominal:
         check_period(read)
         return from_recording(longest_piece(read), sensing, held_out)
