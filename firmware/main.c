@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 // The board of the aeropendulum: an ATmega2560 at 16 MHz.
 //
-// Timer1 makes the PWM, phase-correct, so that its overflow comes in the middle of the pulse: there each sample starts.
-// The ADC's interrupt leads from one conversion to the next; the last one wakes the main loop, which works out the
-// speed, runs the controller, sends the frame, and feeds the watchdog: it lives only while samples come and are sent.
+// Timer1 generates the PWM, phase-correct, so that its overflow is in the middle of the pulse. Each sample starts there.
+// The interrupt of the ADC starts the next conversion. The last one wakes the main loop, which computes the speed, runs
+// the controller, sends the frame and resets the watchdog. So the board runs only while samples are taken and sent.
 #include <avr/eeprom.h>
 #include <avr/interrupt.h>
 #include <avr/io.h>
@@ -29,7 +29,7 @@
 
 #define RAD_PER_COUNT ((float)(2.0 * M_PI / 1024.0))
 
-// Cause of the last reset, before anything else runs: after a watchdog reset it is still on, at its shortest.
+// Cause of the last reset, read before all else: after a watchdog reset the watchdog is still on, with its shortest time.
 static uint8_t reset_cause __attribute__((section(".noinit")));
 
 void save_reset_cause(void) __attribute__((naked, used, section(".init3")));
@@ -47,8 +47,8 @@ ISR(TIMER4_OVF_vect) {
     overflows++;
 }
 
-// The board's time of a count of Timer4, with interrupts off. An overflow that is still pending belongs before the
-// count if the count is small: this interrupt came first.
+// The board's time of a count of Timer4, with interrupts off. A pending overflow was before the count if the count is
+// small; then this interrupt was served first.
 static inline uint32_t board_time(uint16_t count) {
     uint16_t high = overflows;
     if ((TIFR4 & _BV(TOV4)) && count < 0x8000)
@@ -61,7 +61,7 @@ static inline uint32_t board_time(uint16_t count) {
 #define PULSES 8
 static volatile uint32_t pulses[PULSES];
 static volatile uint8_t pulses_in, pulses_out;
-static volatile uint16_t events; // flags to be told with the next sample
+static volatile uint16_t events; // flags of the next sample
 
 ISR(TIMER4_CAPT_vect) {
     uint32_t time = board_time(ICR4);
@@ -78,20 +78,20 @@ ISR(TIMER4_CAPT_vect) {
 
 static struct sample {
     uint32_t time;
-    uint16_t current, angle; // by SSI: all that the encoder sent
+    uint16_t current, angle; // by SSI: all 16 bits of the encoder
     int16_t voltage;
     uint8_t sequence, duty, scheme;
 } sample;
 static volatile bool sample_ready;
 static volatile uint8_t scheme;
 
-static uint8_t duty_register; // what OCR1A was last set to
-static uint8_t duty_acting;   // what acts until the next TOP, if the register was changed after the last one
+static uint8_t duty_register; // last value of OCR1A
+static uint8_t duty_acting;   // duty until the next TOP, if the register was changed since the last one
 static bool duty_changed;
 static volatile uint8_t command_age = COMMAND_TIMEOUT; // periods
 
-// Sets the output compare register, with interrupts off. The timer takes it over at TOP; OCF1B tells if that was since
-// the last sample. Just before TOP it is waited for, 8 us at most, or the two would not be in step.
+// Sets the output compare register, with interrupts off. The timer takes the value at TOP; OCF1B shows whether TOP was
+// since the last sample. Just before TOP this function waits, 8 us at most, because the two could otherwise disagree.
 static void set_duty(uint8_t duty) {
     while (TCNT1 >= TOP - 1 && !(TIFR1 & _BV(OCF1B)))
         ;
@@ -102,7 +102,7 @@ static void set_duty(uint8_t duty) {
     OCR1A = duty_register = duty;
 }
 
-// Reads the AS5040: 10 bits of position and 6 of status. Half a microsecond at least between edges of the clock.
+// Reads the AS5040: 10 bits of position and 6 of status. At least 0.5 us between edges of the clock.
 static inline uint16_t ssi_read(void) {
     uint16_t word = 0;
     PORTA &= ~_BV(SSI_SELECT);
@@ -112,7 +112,7 @@ static inline uint16_t ssi_read(void) {
         word <<= 1;
         __builtin_avr_delay_cycles(5);
         PORTA |= _BV(SSI_CLOCK);
-        __builtin_avr_delay_cycles(6); // the bit is there 0.375 us after the edge
+        __builtin_avr_delay_cycles(6); // the bit is valid 0.375 us after the edge
         if (PINA & _BV(SSI_DATA))
             word |= 1;
     }
@@ -135,9 +135,9 @@ static enum { CURRENT, ANGLE, SETTLE_FIRST, SETTLE_SECOND, VOLTAGE } conversion;
 #define ADC_START (_BV(ADEN) | _BV(ADSC) | _BV(ADIE) | _BV(ADPS2) | _BV(ADPS1) | _BV(ADPS0))
 
 ISR(TIMER1_OVF_vect) {
-    ADCSRA = ADC_START; // the current first: it is only there while the pulse is high
+    ADCSRA = ADC_START; // the current first: it is present only while the pulse is high
     conversion = CURRENT;
-    // both timers run from one prescaler, so samples are exactly this far apart
+    // both timers have one prescaler, so the distance of samples is exactly this
     uint32_t now = board_time(TCNT4);
     do {
         sample.time += PERIOD_TICKS;
@@ -150,7 +150,7 @@ ISR(TIMER1_OVF_vect) {
         set_duty(0);
     sample.scheme = scheme;
     if (scheme == SCHEME_SSI) {
-        sei(); // the receiver cannot wait so long, and the encoder's clock can
+        sei(); // the receiver cannot wait so long, but the clock of the encoder can
         sample.angle = ssi_read();
     }
 }
@@ -172,7 +172,7 @@ ISR(ADC_vect) {
         ADMUX = ADC_VOLTAGE;
         conversion = SETTLE_FIRST;
         break;
-    case SETTLE_FIRST: // the differential stage needs 125 us: what is started before then is discarded
+    case SETTLE_FIRST: // the differential stage needs 125 us: earlier conversions are discarded
         conversion = SETTLE_SECOND;
         break;
     case SETTLE_SECOND:
@@ -220,7 +220,7 @@ ISR(USART0_UDRE_vect) {
         UCSR0B &= ~_BV(UDRIE0);
 }
 
-// Sends all of it, or nothing when there is no room: the host sees the gap in the sequence.
+// Sends all bytes, or none if there is no room. The host sees the gap in the sequence.
 static void send_bytes(const uint8_t *bytes, uint8_t length) {
     uint8_t used = to_send_in - to_send_out;
     if (length >= TO_SEND - used)
@@ -282,7 +282,7 @@ static uint8_t on_duty(const uint8_t *payload) {
     uint16_t duty;
     memcpy(&duty, payload + 2, 2);
     if (enabled && mode == MODE_DIRECT)
-        // rounds duty * TOP / 65535 without a division, which the compiler would move to where interrupts are off
+        // rounds duty * TOP / 65535 without a division, which the compiler would move to a place with interrupts off
         command_duty((uint8_t)(((uint32_t)duty * TOP + 32895) >> 16));
     return OK;
 }
@@ -334,7 +334,7 @@ static uint8_t on_mode(const uint8_t *payload) {
     return OK;
 }
 
-static void on_calibration(const uint8_t *payload) { // acknowledged when it is written
+static void on_calibration(const uint8_t *payload) { // acknowledged after it is written
     memcpy(calibration, payload + 1, CALIBRATION_SIZE);
     calibration_left = CALIBRATION_SIZE;
 }
@@ -423,7 +423,7 @@ static void finish_sample(void) {
     }
     if (mode == MODE_PID) {
         flags |= FLAG_PID;
-        // a reading of the encoder that cannot be trusted holds the duty
+        // an invalid reading of the encoder holds the duty
         if (enabled && !(flags & (FLAG_SSI_PARITY | FLAG_SSI_STATUS))) {
             uint8_t duty = pid_step(&pid, RAD_PER_COUNT * s.angle, PERIOD_S) * TOP + 0.5f;
             ATOMIC_BLOCK(ATOMIC_RESTORESTATE) {
@@ -475,7 +475,7 @@ static void start(void) {
     ADCSRA = ADC_START & ~(_BV(ADSC) | _BV(ADIE));
     DIDR0 = 0x0F; // A0..A3 are analogue only
 
-    GTCCR = _BV(TSM) | _BV(PSRSYNC); // holds the prescaler: both timers start at once
+    GTCCR = _BV(TSM) | _BV(PSRSYNC); // holds the prescaler, so that both timers start together
     OCR1A = 0;
     OCR1B = TOP;
     TCNT1 = TCNT4 = 0;
@@ -495,13 +495,13 @@ int main(void) {
     wdt_enable(WDTO_60MS);
     set_sleep_mode(SLEEP_MODE_IDLE);
     sei();
-    send_bytes((const uint8_t[]){0}, 1); // ends the frame that a reset cut short
+    send_bytes((const uint8_t[]){0}, 1); // ends a frame that a reset interrupted
     send_hello();
     for (;;) {
         cli();
         if (!sample_ready && received_out == received_in) {
             sleep_enable();
-            sei(); // takes effect after the next instruction: nothing is missed
+            sei(); // takes effect after the next instruction, so that no interrupt is missed
             sleep_cpu();
             sleep_disable();
         }

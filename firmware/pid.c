@@ -20,14 +20,14 @@ float pid_step(struct pid *p, float measurement, float period) {
     p->started = true;
     float rate = (measurement - p->before) / period;
     p->before = measurement;
-    float share = g->filter > period ? period / g->filter : 1.0f; // forward Euler is not stable beyond
+    float share = g->filter > period ? period / g->filter : 1.0f; // beyond 1, forward Euler is not stable
     p->derivative += share * (rate - p->derivative);
 
     float error = p->reference - measurement;
     float wanted = g->kp * error + p->integral - g->kd * p->derivative;
     float output = wanted < g->low ? g->low : wanted > g->high ? g->high : wanted;
     float step = period * g->ki * error;
-    // a limited output stops the integral, unless it leads back
+    // a limited output stops the integral, unless the integral leads back into the range
     if (output == wanted || (wanted > output) == (step < 0.0f))
         p->integral += step;
     return output;

@@ -18,13 +18,13 @@ struct pid {
     bool started;
 };
 
-// Whether a controller can run with these.
+// Whether the gains are valid.
 bool gains_valid(const struct gains *g);
 
-// Forgets the past, not the gains and the reference.
+// Resets the state; gains and reference stay.
 void pid_reset(struct pid *p);
 
-// Takes one measurement (rad), `period` s after the one before; returns the duty.
+// Returns the duty for a measurement (rad), `period` s after the one before.
 float pid_step(struct pid *p, float measurement, float period);
 
 #endif

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// What is wired where; README.md, "Wiring", has the same as a table.
+// The pins; README.md, "Wiring", has the same as a table.
 #ifndef PINS_H
 #define PINS_H
 

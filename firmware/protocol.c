@@ -21,7 +21,7 @@ static uint16_t crc16(const uint8_t *bytes, uint8_t length) {
 
 uint8_t frame_encode(const uint8_t *payload, uint8_t length, uint8_t frame[FRAME_MAX]) {
     uint16_t crc = crc16(payload, length);
-    uint8_t code = 0; // where the distance to the next zero goes
+    uint8_t code = 0; // place of the distance to the next zero
     uint8_t at = 1;
     for (uint8_t i = 0; i < length + 2; i++) {
         uint8_t byte = i < length ? payload[i] : i == length ? crc >> 8 : crc & 0xFF;
@@ -37,7 +37,7 @@ uint8_t frame_encode(const uint8_t *payload, uint8_t length, uint8_t frame[FRAME
     return at;
 }
 
-// Undoes COBS in place; returns the length, or 0 when a code points past the end.
+// Decodes COBS in place. Returns the length, or 0 if a code points past the end.
 static uint8_t unstuff(uint8_t *bytes, uint8_t length) {
     uint8_t from = 0, to = 0;
     while (from < length) {
@@ -62,7 +62,7 @@ uint8_t frame_decode(struct decoder *d, uint8_t byte) {
     }
     uint8_t length = d->length;
     d->length = 0;
-    if (length == 0) // zeros between frames mean nothing
+    if (length == 0) // zeros between frames have no meaning
         return 0;
     if (length <= FRAME_MAX) {
         length = unstuff(d->bytes, length);

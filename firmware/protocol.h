@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The wire protocol; README.md, "Protocol", says what every field means.
+// The serial protocol; README.md, "Protocol", describes the fields.
 #ifndef PROTOCOL_H
 #define PROTOCOL_H
 
@@ -49,21 +49,21 @@ enum flag {
 
 #define CALIBRATION_SIZE 16
 
-// A frame is COBS(payload, CRC-16 big endian) and a zero.
+// A frame is COBS(payload, CRC-16 big endian) and a zero byte.
 #define PAYLOAD_MAX 32
 #define FRAME_MAX (PAYLOAD_MAX + 4)
 
-// Writes the frame of a payload of 1..PAYLOAD_MAX bytes; returns its length, the closing zero included.
+// Writes the frame of a payload of 1..PAYLOAD_MAX bytes. Returns its length with the final zero.
 uint8_t frame_encode(const uint8_t *payload, uint8_t length, uint8_t frame[FRAME_MAX]);
 
-// What has come of a frame.
+// The received part of a frame.
 struct decoder {
     uint8_t bytes[FRAME_MAX];
-    uint8_t length; // of bytes, or FRAME_MAX + 1: too long, wait for its end
+    uint8_t length; // of bytes; FRAME_MAX + 1: too long, wait for its end
     bool bad;       // set when a frame was refused; the caller clears it
 };
 
-// Takes one byte from the line. Returns the length of the payload, now at d->bytes, when this byte closes a good frame.
+// Decodes one byte. Returns the length of the payload in d->bytes if the byte completes a valid frame, else 0.
 uint8_t frame_decode(struct decoder *d, uint8_t byte);
 
 #endif

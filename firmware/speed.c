@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "speed.h"
 
-// So many refused in a row, and it is the past that was wrong.
+// After so many rejected pulses in a row, the earlier pulses were wrong.
 #define PATIENCE 3
 
-// Ticks that two periods of a steady rotor may differ by, for the edges' own rounding.
+// Greatest difference of two periods of a steady rotor by the rounding of the edges, ticks.
 #define SLACK 8.0f
 
-// Whether the rotor can have got from one period to the next within the acceleration that the motor has.
+// Whether the greatest acceleration allows the second period after the first one.
 static bool follows(uint32_t before, uint32_t after) {
     const float half = 0.5f * GREATEST_ACCELERATION / ((float)TICKS_PER_S * (float)TICKS_PER_S);
     float p = before, q = after;
@@ -26,7 +26,7 @@ enum pulse speed_pulse(struct speed *s, uint32_t time) {
     if (s->expected != 0 && !follows(s->expected, period)) {
         if (++s->refused >= PATIENCE) {
             *s = (struct speed){.period = s->period, .last = time, .started = true};
-        } else if (period > s->expected) { // one was missed: its time is good, its period is not
+        } else if (period > s->expected) { // a pulse was missed: the time is valid, the period is not
             s->last = time;
         }
         return PULSE_REJECTED;

@@ -248,7 +248,7 @@ static bool pulse_high(struct board *b, uint64_t now) {
     return b->outcome.running && away < (uint64_t)b->acting * PRESCALER[*reg(b, TCCR1B) & 7];
 }
 
-// What the H-bridge gets: the pin driven by OC1A, forwards, not braked.
+// Input of the H-bridge: the pin driven by OC1A, forwards, not braked.
 static uint8_t duty(struct board *b) {
     const bool driven = (*reg(b, TCCR1A) & 0xC0) == 0x80 && *reg(b, DDRB) & 0x20;
     const bool forwards = *reg(b, DDRB) & *reg(b, PORTB) & 0x40;
@@ -293,8 +293,8 @@ static avr_cycle_count_t adc_sample(avr_t *avr, avr_cycle_count_t when, void *pa
     (void)avr;
     const bool differential = b->mux >= 0x08;
     double volts = channel(b, b->mux, when);
-    // p. 275: results of conversions started within 125 us of choosing a differential channel are to be discarded.
-    // Here they lean to what the stage amplified before, by half at once and 2 % after 107 us.
+    // p. 275: results of conversions started within 125 us after the selection of a differential channel must be
+    // discarded. Here they contain a part of the earlier value of the stage: half of it at once, 2 % after 107 us.
     if (differential && b->started < b->selected + SETTLING)
         volts += (b->before - volts) * exp2(-1.0 - (double)(b->started - b->selected) / 400.0);
     b->held = volts;
@@ -446,8 +446,8 @@ static uint16_t as5040_word(const struct pins *pins) {
     return word | ((__builtin_popcount(word) & 1) ^ (pins->parity_error & 1));
 }
 
-// Data sheet 1.6, p. 11: CSn low, 500 ns, the first falling edge latches, each rising edge brings a bit out 375 ns
-// later; clock of 1 MHz at most.
+// Data sheet 1.6, p. 11: CSn low, 500 ns, the first falling edge latches, each rising edge outputs a bit 375 ns later;
+// the clock is at most 1 MHz.
 static void write_porta(avr_t *avr, avr_io_addr_t address, uint8_t value, void *param) {
     struct board *b = param;
     const uint8_t changed = avr->data[address] ^ value;
@@ -478,7 +478,7 @@ static uint8_t read_pina(avr_t *avr, avr_io_addr_t address, void *param) {
     return (avr->data[PORTA] & ~0x04) | (bit ? 0x04 : 0);
 }
 
-// --- the whole -------------------------------------------------------------------------------------------------------
+// --- the board -------------------------------------------------------------------------------------------------------
 
 static void on_reset(avr_io_t *io) {
     struct board *b = (struct board *)((char *)io - offsetof(struct board, io));

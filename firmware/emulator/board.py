@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The board with the aeropendulum on its pins, in simulated time: one period of the PWM a call.
+"""The board with the aeropendulum on its pins, in simulated time: one period of the PWM per call.
 
-The processor and what is on the chip are `board.c`; the plant is `aeropend_sim`, stepped here. Both go from TOP to TOP
-of Timer1, where the duty changes, with the sample in the middle, where the pulse is.
+`board.c` emulates the processor and its peripherals; the plant is `aeropend_sim`. Both are stepped from TOP to TOP of
+Timer1, where the duty changes. The sample is in the middle of the period, where the pulse is.
 """
 
 from __future__ import annotations
@@ -24,16 +24,17 @@ PROGRAM = BUILD / "aeropend.elf"
 LIBRARY = BUILD / "libboard.so"
 
 CLOCK_HZ = 16_000_000
+"""[Hz] Clock of the processor."""
 PERIOD_CYCLES = 64 * 510
 TICK_CYCLES = 8
-"""Cycles of one tick of the board's time."""
+"""[cycles] One tick of the board's time."""
 REFERENCE_V = 2.56
 CURRENT_V_PER_A = 1.65
-"""At A0: the motor shield gives 3.3 V at 2 A."""
+"""[V/A] Scale of the current at A0: the motor shield gives 3.3 V at 2 A."""
 LOW_SIDE_V, LOW_SIDE_OHM = 0.3, 0.5
-"""The H-bridge's transistor and shunt between the motor's lower terminal (A1) and ground."""
+"""[V], [Ω] Voltage drop of the H-bridge between the motor's lower terminal (A1) and ground: transistor and shunt."""
 ANGLE_ZERO = 256
-"""Counts of the encoder when the arm hangs."""
+"""[counts] Reading of the encoder when the arm hangs."""
 ANGLE_COUNTS = 1024
 GOOD_STATUS = 0b10000
 """OCF set, COF, LIN, MagINC and MagDEC clear."""
@@ -43,7 +44,7 @@ POWER_ON, EXTERNAL, BROWN_OUT = 1, 2, 4
 
 
 class Pins(ctypes.Structure):
-    """What is on the pins during a period; V and counts. See `board.h`."""
+    """State of the pins during a period, in V and counts; see `board.h`."""
 
     _fields_ = [
         ("current", ctypes.c_double),
@@ -57,7 +58,7 @@ class Pins(ctypes.Structure):
 
 
 class Outcome(ctypes.Structure):
-    """What came of a period. See `board.h`."""
+    """Result of a period; see `board.h`."""
 
     _fields_ = [
         ("start", ctypes.c_uint64),
@@ -72,7 +73,7 @@ class Outcome(ctypes.Structure):
 
 
 class Load(ctypes.Structure):
-    """What interrupts took, in cycles, and the stack, in bytes. See `board.h`."""
+    """Load by the interrupts, in cycles, and size of the stack, in bytes; see `board.h`."""
 
     _fields_ = [
         ("cycles", ctypes.c_uint64),
@@ -84,11 +85,11 @@ class Load(ctypes.Structure):
 
 
 class BoardError(RuntimeError):
-    """The emulator cannot be used; the message is one line for a person."""
+    """The emulator cannot be used. The message is one line."""
 
 
 class Chip:
-    """The processor with its program, what is on the pins given by the caller."""
+    """The processor with its program; the caller sets the pins."""
 
     def __init__(self, program: Path = PROGRAM, library: Path = LIBRARY) -> None:
         """Load a program and turn the power on.
@@ -98,7 +99,7 @@ class Chip:
             library: the emulator.
 
         Raises:
-            BoardError: one of them is missing, or is not what it should be.
+            BoardError: one of them is missing or cannot be loaded.
         """
         for file in (program, library):
             if not file.exists():
@@ -121,7 +122,7 @@ class Chip:
         self._outcome = ctypes.byref(self.outcome)
 
     def close(self) -> None:
-        """Let go of the memory; nothing else may be called after this."""
+        """Free the memory. No other method may be called after this."""
         if self._handle:
             self._library.board_free(self._handle)
             self._handle = ctypes.c_void_p()
@@ -131,15 +132,15 @@ class Chip:
             self.close()
 
     def run(self, pins: Pins, edges: Sequence[int] | np.ndarray = (), periods: int = 1) -> Outcome:
-        """Run periods with the same on the pins.
+        """Run periods with constant pins.
 
         Args:
-            pins: what is on them.
-            edges: rising edges at the IR input, cycles from the start, ascending.
-            periods: how many.
+            pins: state of the pins.
+            edges: [cycles] rising edges at the IR input, from the start, ascending.
+            periods: number of periods.
 
         Returns:
-            What came of it; the same object each time.
+            The result; the same object at each call.
 
         Raises:
             BoardError: the processor has stopped.
@@ -153,11 +154,19 @@ class Chip:
         return self.outcome
 
     def send(self, data: bytes, delay: int = 0) -> int:
-        """Put bytes on the line to the board, the first one `delay` cycles from now; return how many it took."""
+        """Send bytes to the board.
+
+        Args:
+            data: the bytes.
+            delay: [cycles] time until the first one.
+
+        Returns:
+            The number of bytes for which there was room.
+        """
         return int(self._library.board_send(self._handle, data, len(data), delay))
 
     def receive(self) -> bytes:
-        """Take what the board has sent since the last call."""
+        """The bytes that the board has sent since the last call."""
         count = self._library.board_receive(self._handle, self._bytes, None, len(self._bytes))
         return ctypes.string_at(self._bytes, count)
 
@@ -167,11 +176,15 @@ class Chip:
         return ctypes.string_at(self._bytes, count), list(self._times[:count])
 
     def reset(self, cause: int = EXTERNAL) -> None:
-        """Reset the processor; its time goes on, its memory stays."""
+        """Reset the processor. Its time continues, its memory stays.
+
+        Args:
+            cause: of the reset, as in MCUSR.
+        """
         self._library.board_reset(self._handle, cause)
 
     def hang(self) -> None:
-        """Let the main program hang where it is, interrupts going on, until a reset."""
+        """Stop the main program until a reset; interrupts continue."""
         self._library.board_hang(self._handle)
 
     @property
@@ -191,7 +204,7 @@ class Chip:
 
     @property
     def load(self) -> Load:
-        """What interrupts have taken, and the stack."""
+        """Load by the interrupts so far, and size of the stack."""
         load = Load()
         self._library.board_load(self._handle, ctypes.byref(load))
         return load
@@ -199,7 +212,7 @@ class Chip:
 
 @dataclass(frozen=True)
 class Truth:
-    """The plant at a sampling instant, SI."""
+    """State of the plant at a sampling instant, SI units."""
 
     theta: float
     theta_dot: float
@@ -209,24 +222,24 @@ class Truth:
 
 
 class Plant(Rig):
-    """The rig in halves of the PWM's period, what it reports as voltages, bits and pulses in place of numbers."""
+    """The rig, simulated in halves of the PWM period. Its readings are voltages, bits and pulses."""
 
     def __init__(self, model: Model, seed: int = 0, angle_zero: int = ANGLE_ZERO) -> None:
         """At rest, hanging.
 
         Args:
-            model: numbers and effects; what it says of resolution is left to the board.
-            seed: of all chance.
-            angle_zero: counts of the encoder when the arm hangs.
+            model: parameters and effects; the board replaces the resolutions.
+            seed: of all random numbers.
+            angle_zero: [counts] reading of the encoder when the arm hangs.
         """
         bare = {"angle_lsb": 0.0, "current_lsb": 0.0, "voltage_lsb": 0.0, "speed_tick": 0.0, "speed_noise": 0.0,
                 "speed_pulses_per_rev": 1.0}
         self._zero = angle_zero
         self.pins = Pins(status=GOOD_STATUS)
         self.stuck = False
-        """The encoder stays where it is."""
+        """Whether the encoder keeps its value."""
         self.dropout = False
-        """The IR sensor sees nothing."""
+        """Whether the IR sensor gives no pulses."""
         super().__init__(Model(model.name, model.model, {**model.sensing, **bare}, model.effects), seed,
                          SAMPLE_PERIOD / 2)
 
@@ -237,10 +250,13 @@ class Plant(Rig):
         self._false_pulses: list[float] = []
 
     def step(self, duty: float) -> tuple[Pins, list[int], Truth]:
-        """Advance by one period of the PWM with a duty (0..1).
+        """Advance by one period of the PWM.
+
+        Args:
+            duty: 0..1.
 
         Returns:
-            What is on the pins in it, rising edges of the IR sensor (cycles from its start), the state in its middle.
+            State of the pins, rising edges of the IR sensor (cycles from the start), state in the middle.
         """
         reading, state = self.run(np.array([duty, duty]))
         memory, chain = self._memory, self._chain
@@ -248,8 +264,8 @@ class Plant(Rig):
         self._note_false(reading[1, 0])
         times = self._new_pulse(memory.last_pulse)
         self._note_false(reading[1, 1])
-        # the rest of the period has not been read yet
-        last, _, _ = sensing.time_pulses(memory, self._state.omega, self._state.rotor_angle, _NO_CHANCE, 0.0, chain)
+        # pulses between the last reading and the end of the period
+        last, _, _ = sensing.time_pulses(memory, self._state.omega, self._state.rotor_angle, _NO_SPIKES, 0.0, chain)
         times += self._new_pulse(last)
         times += [at for at in self._false_pulses if at < start + 2.0 * self.period]
         self._false_pulses = [at for at in self._false_pulses if at >= start + 2.0 * self.period]
@@ -257,7 +273,7 @@ class Plant(Rig):
         theta, _, i_a, v_a = reading[:, 1].tolist()
         pins = self.pins
         if not self.stuck:
-            # its PWM output is high for p + 1 of 1025 us; divider and filter make 2.56 V of 5 V
+            # the PWM output is high for p + 1 of 1025 us; divider and filter scale 5 V to 2.56 V
             pins.angle = REFERENCE_V * (self._counts(theta) + 1.0) / 1025.0
             unfiltered = sensing._encoder(state[0, 1], chain) + theta - memory.stage2
             pins.position = round(self._counts(unfiltered)) % ANGLE_COUNTS
@@ -278,17 +294,17 @@ class Plant(Rig):
         return [at]
 
     def _note_false(self, speed: float) -> None:
-        """A speed read far too high (`speed_spikes`) becomes a false pulse that soon after the last true one."""
+        """Turn a false speed (`speed_spikes`) into a false pulse: 2π / speed after the last true one."""
         if not math.isnan(self._turn) and speed * self._turn > 2.0 * math.pi * 1.2:
             self._false_pulses.append(self._pulse + 2.0 * math.pi / speed)
         self._turn = math.nan
 
 
-_NO_CHANCE = np.ones(2)
+_NO_SPIKES = np.ones(2)
 
 
 class Board:
-    """The board in its rig: chip and plant together, for tests in simulated time."""
+    """The board in its rig: chip and plant, for tests in simulated time."""
 
     def __init__(self, model: Model | None = None, seed: int = 0, program: Path = PROGRAM,
                  angle_zero: int = ANGLE_ZERO) -> None:
@@ -296,9 +312,9 @@ class Board:
 
         Args:
             model: of the plant; `bench` by default.
-            seed: of all chance.
+            seed: of all random numbers.
             program: ELF file.
-            angle_zero: counts of the encoder when the arm hangs.
+            angle_zero: [counts] reading of the encoder when the arm hangs.
 
         Raises:
             BoardError: the program or the emulator is missing.
@@ -306,9 +322,9 @@ class Board:
         self.chip = Chip(program)
         self.plant = Plant(model or load("bench"), seed, angle_zero)
         self.powered = True
-        """Without power the board does nothing, and its PWM pin is low."""
+        """Whether the board has power; without it the PWM pin is low."""
         self.truth = Truth(0.0, 0.0, 0.0, 0.0, 0.0)
-        """The plant at the last sampling instant."""
+        """State of the plant at the last sampling instant."""
 
     def step(self) -> Outcome:
         """Run one period of the PWM."""
@@ -319,9 +335,9 @@ class Board:
         return self.chip.run(pins, edges)
 
     def send(self, data: bytes) -> int:
-        """Put bytes on the line to the board; return how many it took."""
+        """Send bytes to the board; return the number for which there was room."""
         return self.chip.send(data)
 
     def receive(self) -> bytes:
-        """Take what the board has sent since the last call."""
+        """The bytes that the board has sent since the last call."""
         return self.chip.receive()

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The emulated board on a serial port of this machine, at wall-clock pace: what the bridge connects to.
+"""The emulated board on a serial port of this machine, in real time. The bridge connects to this port.
 
-A period of the PWM is run when it begins by the wall clock, from TOP to TOP of Timer1; the sample in its middle is
-taken 1.02 ms later. What has come on the port by then reaches the board; each frame leaves when its last byte would.
+A period of the PWM, from TOP to TOP of Timer1, is simulated at its start by the wall clock. The sample in its middle is
+taken 1.02 ms later. Bytes that have arrived at the port reach the board. Each frame is sent at the time of its last
+byte.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ from aeropend_sim.ros.realtime import monotonic_to_ros_ns, prepare_thread, reque
 
 PERIOD_NS = PERIOD_CYCLES * 1_000_000_000 // CLOCK_HZ
 BACKLOG = 49
-"""Periods that the program may be late and still catch up; when it is later, the board's time stops meanwhile."""
+"""Greatest lateness, in periods, that the program makes up for; if it is later, the board's time stops. A choice."""
 
 FAULTS = {
     "reset": "the reset button",
@@ -56,17 +57,17 @@ FAULTS = {
     "unplug": "no cable, no power (default 1 s); then a new power-on",
     "flip": "a bit in a byte is flipped, both ways; RATE per byte (default 0.001)",
     "lose": "a byte is lost, both ways; RATE per byte (default 0.001)",
-    "stuck": "the encoder stays where it is",
+    "stuck": "the encoder keeps its value",
     "parity": "the encoder's SSI parity is wrong",
-    "magnet": "the encoder says that the magnet is out of range",
-    "dropout": "the IR sensor sees nothing",
+    "magnet": "the encoder reports that the magnet is out of range",
+    "dropout": "the IR sensor gives no pulses",
 }
 
 DESCRIPTION = "The emulated board with the aeropendulum, on a serial port of this machine. Prints the port's path."
 
-EPILOG = """faults, NAME[@START][+LENGTH][:RATE] with times in s from the start; without LENGTH they last:
+EPILOG = """faults, NAME[@START][+LENGTH][:RATE] with times in s from the start; without LENGTH they do not end:
 """ + "\n".join(f"  {name:<10} {text}" for name, text in FAULTS.items()) + """
-  They can also be typed while it runs, one a line without START; 'end' ends those that last.
+  You can also type them while the board runs, one per line, without START; 'end' ends all of them.
 
 examples:
   emulated_board --link /tmp/aeropend
@@ -77,12 +78,19 @@ exit codes: 0 ended, by Ctrl-C too; 2 it cannot run (one line says why)"""
 
 
 class UsageError(ValueError):
-    """What the user asked for cannot be done; the message is one line."""
+    """A request of the user that cannot be met. The message is one line."""
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault: when it starts (s), how long it lasts (s; inf for ever), and its rate per byte."""
+    """One fault.
+
+    Attributes:
+        name: its name in `FAULTS`.
+        start: [s] its start.
+        length: [s] its duration; inf: without end.
+        rate: its probability per byte.
+    """
 
     name: str
     start: float
@@ -93,8 +101,12 @@ class Fault:
     def parse(cls, text: str, now: float | None = None) -> Fault:
         """Read NAME[@START][+LENGTH][:RATE].
 
+        Args:
+            text: the text.
+            now: [s] start without START; None: START is required.
+
         Raises:
-            UsageError: it is not one.
+            UsageError: the text has another form.
         """
         number = r"([0-9.]+(?:e-?[0-9]+)?)"
         match = re.fullmatch(rf"(\w+)(?:@{number})?(?:\+{number})?(?::{number})?", text.strip())
@@ -114,12 +126,19 @@ class Fault:
 
 
 class Port:
-    """A pseudo-terminal in raw mode, with a link to it that stays when it is unplugged and comes back."""
+    """A pseudo-terminal in raw mode, and a symbolic link to it.
+
+    Args:
+        link: path of the link; None for no link.
+
+    Attributes:
+        lost: number of bytes that were not read in time.
+        path: of the terminal.
+    """
 
     def __init__(self, link: Path | None) -> None:
         self._link = link
         self.lost = 0
-        """Bytes that nobody took in time."""
         if link is not None and (link.exists() or link.is_symlink()):
             if not link.is_symlink():
                 raise UsageError(f"{link} exists and is not a link: name another with --link")
@@ -129,8 +148,8 @@ class Port:
         self.plug()
 
     def plug(self) -> None:
-        """Make the port appear."""
-        # a slave held open keeps the master readable when the other side closes
+        """Create the port."""
+        # an open slave keeps the master readable when the other side closes
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -142,14 +161,14 @@ class Port:
                 raise UsageError(f"cannot make the link {self._link}: {error.strerror}") from None
 
     def unplug(self) -> None:
-        """Make it disappear; whoever has it open gets an error."""
+        """Remove the port; programs that have it open get an error."""
         if self._link is not None:
             self._link.unlink(missing_ok=True)
         os.close(self._slave)
         os.close(self._master)
 
     def read(self) -> bytes:
-        """Take what has come from the other side."""
+        """The bytes that have arrived from the other side."""
         try:
             return os.read(self._master, 4096)
         except OSError as error:
@@ -158,7 +177,7 @@ class Port:
             return b""
 
     def write(self, data: bytes) -> None:
-        """Send as much as there is room for; the rest is lost, and what is old goes first, as in a driver."""
+        """Send bytes as far as there is room. The others are lost, and old bytes are removed first, as in a driver."""
         if not data:
             return
         try:
@@ -168,7 +187,7 @@ class Port:
         if sent < len(data):
             self.lost += len(data) - sent
             with suppress(termios.error):
-                termios.tcflush(self._slave, termios.TCIFLUSH)  # nobody reads: let go of what is stale
+                termios.tcflush(self._slave, termios.TCIFLUSH)  # no program reads: remove old bytes
 
 
 class EmulatedBoard:
@@ -304,7 +323,7 @@ def _sleep_until(deadline_ns: int) -> None:
 
 
 def _numbers(effects: Sequence[str], others: Sequence[str]) -> dict[str, float]:
-    """Read `--effect` and `--set` into a model file's dotted names."""
+    """Convert `--effect` and `--set` to the dotted names of a model file."""
     flat: dict[str, float] = {}
     for text in [f"effects.{effect}" for effect in effects] + list(others):
         name, equals, value = text.partition("=")
@@ -320,7 +339,7 @@ def _numbers(effects: Sequence[str], others: Sequence[str]) -> dict[str, float]:
 
 
 def _model(source: str, preset: str) -> Model:
-    """Read a model as the plant node does: a preset, or a file in which a preset supplies what it leaves out."""
+    """Read a model like the plant node: a preset, or a file whose missing parameters come from a preset."""
     try:
         return load(source)
     except ModelError as error:
@@ -339,20 +358,20 @@ def _parser() -> Parser:
                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", default="bench", metavar="PRESET|FILE", help="model of the plant (default bench)")
     parser.add_argument("--preset", default="bench", choices=PRESETS,
-                        help="supplies what the model file leaves out (default bench)")
+                        help="supplies the missing parameters of the model file (default bench)")
     parser.add_argument("--effect", action="append", default=[], metavar="ID[.PARAMETER=VALUE]",
-                        help="an effect in the plant, by default with the catalogue's numbers")
+                        help="an effect of the plant; without a value it has the defaults of the catalogue")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE",
-                        help="a number of the model, as in model.R_a=1.2")
-    parser.add_argument("--seed", type=int, default=0, help="seed of all chance (default 0)")
+                        help="a parameter of the model, as in model.R_a=1.2")
+    parser.add_argument("--seed", type=int, default=0, help="seed of all random numbers (default 0)")
     parser.add_argument("--angle-zero", type=int, default=ANGLE_ZERO, metavar="COUNTS",
-                        help=f"what the encoder reads when the arm hangs (default {ANGLE_ZERO})")
-    parser.add_argument("--link", type=Path, metavar="PATH", help="a link to the port that stays the same")
+                        help=f"reading of the encoder when the arm hangs (default {ANGLE_ZERO})")
+    parser.add_argument("--link", type=Path, metavar="PATH", help="a symbolic link to the port")
     parser.add_argument("--fault", action="append", default=[], metavar="FAULT", help="a fault, see below")
     parser.add_argument("--program", type=Path, default=PROGRAM, metavar="ELF", help="the board's program")
     parser.add_argument("--truth", type=Path, metavar="FILE",
-                        help="write what really was, a line a sample: system time of sampling (ns), duty that acts "
-                        "next, duty register, when it was last changed (ns), theta, theta_dot, i_a, omega, v_a")
+                        help="write the true states, one line per sample: system time of sampling (ns), duty that acts "
+                        "next, duty register, time of its last change (ns), theta, theta_dot, i_a, omega, v_a")
     return parser
 
 
@@ -367,7 +386,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         board = Board(model, arguments.seed, arguments.program, arguments.angle_zero)
         if arguments.truth is not None:
             truth = arguments.truth.open("x", encoding="utf-8")
-        board.plant.step(0.0)  # compiles before the first deadline
+        board.plant.step(0.0)  # compiles it before the first deadline
         board.plant.reset()
         port = Port(arguments.link)
         program = EmulatedBoard(board, port, faults, arguments.seed, truth)

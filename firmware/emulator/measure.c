@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Runs the program for some seconds with all that it can have to do (SSI, PID, a command and a pulse in each period),
-// and prints its stack and what interrupts took.
+// Runs the program for some seconds at its greatest load (SSI, PID, a command and a pulse in each period), and prints its
+// stack and the times of its interrupts.
 #include <stddef.h>
 #include <stdio.h>
 #include <string.h>
@@ -35,7 +35,7 @@ int main(int argc, char **argv) {
     payload[0] = PID_REFERENCE;
     memcpy(payload + 1, &reference, sizeof reference);
     for (uint32_t i = 0; i < PERIODS; i++) {
-        const uint32_t edge = i * 197 % PERIOD_CYCLES; // at every place in the period in turn
+        const uint32_t edge = i * 197 % PERIOD_CYCLES; // at each place in the period in turn
         pins.position = (uint16_t)(400 + i % 50);
         command(b, payload, 5);
         if (board_run(b, &pins, 1, &edge, i & 1, &outcome) != 0)

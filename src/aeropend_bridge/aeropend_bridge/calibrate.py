@@ -215,7 +215,8 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument("file", type=Path, metavar="FILE", help="calibration file to write")
     parser.add_argument("--port", type=Path, default=Path("/dev/ttyACM0"),
                         help="serial port of the board (default: %(default)s)")
-    parser.add_argument("--seconds", type=float, default=3.0, help="for each way of reading the encoder (default: 3)")
+    parser.add_argument("--seconds", type=float, default=3.0,
+                        help="time for each way of reading the encoder (default: 3)")
     parser.add_argument("--base", type=Path, metavar="FILE", help="calibration file that supplies the scales")
     parser.add_argument("--force", action="store_true", help="replace FILE if there is one")
     options = parser.parse_args(args)
