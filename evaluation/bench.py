@@ -52,6 +52,7 @@ FIGURES: dict[str, Callable[[bool], list[Figure]]] = {
     "sparse-lorenz": identification.study,
     "sparse-speed": identification.speed,
     "optimiser": estimation.optimiser,
+    "sparse-fit": identification.fitting,
     "plant": nodes.plant,
     "record": nodes.record,
     "emulator": hardware.emulator,
