@@ -14,8 +14,8 @@ import pytest
 from evaluation.blind import cases
 
 from aeropend_ident.diagnosis.diagnosis import diagnose
-from aeropend_ident.diagnosis.document import from_json, to_json
-from aeropend_ident.diagnosis.report import curves, number_format
+from aeropend_ident.diagnosis.document import Curve, UnknownEffect, from_json, to_json
+from aeropend_ident.diagnosis.report import curves, drawing, number_format, parameters, traces
 from aeropend_ident.diagnosis.report import page as report_page
 from aeropend_ident.diagnosis.results import document, verdict_lines
 from aeropend_ident.signals.signals import from_arrays
@@ -164,14 +164,14 @@ def test_what_is_referred_to_is_there(page):
 
 
 def test_traces_are_drawn_and_can_be_zoomed(page):
-    drawings = page.data()
-    assert drawings
+    figures = page.data()
+    assert figures
     paths = [a for a in page.all("path") if "data-series" in a]
-    assert len(paths) == sum(len(d["series"]) for d in drawings)
+    assert len(paths) == sum(len(f["series"]) for f in figures)
     assert all(path["d"].startswith("M") for path in paths)
-    for drawing in drawings:
-        assert drawing["stop"] > drawing["start"]
-        lengths = {len(base64.b64decode(s["data"])) for s in drawing["series"]}
+    for figure in figures:
+        assert figure["stop"] > figure["start"]
+        lengths = {len(base64.b64decode(s["data"])) for s in figure["series"]}
         assert len(lengths) == 1
         assert lengths.pop() > 2 * 1000
 
@@ -257,7 +257,7 @@ def test_an_unknown_beside_what_was_found(friction, strange):
 
 
 def of(variable, at, value, unit="rad/s²"):
-    return {"variable": variable, "unit": unit, "at": [float(x) for x in at], "value": [float(v) for v in value]}
+    return Curve(variable, unit, tuple(float(x) for x in at), tuple(float(v) for v in value))
 
 
 def plain(text):
@@ -269,15 +269,15 @@ NINE = np.linspace(-2.0, 2.0, 9)
 
 
 def test_curves_are_drawn_without_what_a_number_does():
-    drawn = curves.drawn({"place": "arm", "curves": [
+    drawn = curves.draw(UnknownEffect("arm", (
         of("theta", NINE / 4, 5.0 * NINE + 3.0),
-        of("theta_dot", NINE, -np.abs(NINE) - 2.0 * NINE + 7.0)]}, FACTORS, 49.0)
-    assert [c["plain"] for c in drawn["cells"]] == ["the arm rate", "the arm angle"]
-    first, second = (plain(c["words"]) for c in drawn["cells"])
+        of("theta_dot", NINE, -np.abs(NINE) - 2.0 * NINE + 7.0))), FACTORS, 49.0).pictures
+    assert [c.variable.phrase for c in drawn] == ["the arm rate", "the arm angle"]
+    first, second = (plain(c.text) for c in drawn)
     assert first == ("Peaks at 0 rad/s² near 0 rad/s, from −2.0 rad/s² at −2.0 rad/s to −2.0 rad/s² at 2.0 rad/s; "
                      "besides, a slope by −8.0 rad/s² in all, which the model's numbers may do as well.")
     assert second == "Next to nothing; besides, a slope by 20 rad/s² in all, which the model's numbers may do as well."
-    heights = [float(p.split()[1]) for p in drawn["cells"][1]["curve"][1:].split("L")]
+    heights = [float(p.split()[1]) for p in drawn[1].curve[1:].split("L")]
     assert max(heights) - min(heights) <= 1.0
 
 
@@ -285,21 +285,20 @@ def test_curves_that_are_multiplied_keep_their_slope():
     late = [of(f"step of the duty, {k} samples ago", [0.0, 1.0], v, "V")
             for k, v in enumerate(([-2.0], [0.0, -1.0], [-0.5]))]
     slow = of("omega, slowly (share of the thrust)", 50.0 + NINE, -NINE / 20.0, "-")
-    share = curves.drawn({"place": "thrust", "curves": [slow]}, FACTORS, 49.0)
-    assert share["cells"][0]["term_unit"] == "%"
-    assert "falls from 0 % at 48 rad/s to −20 % at 52 rad/s" in plain(share["cells"][0]["said"])
-    steps = curves.drawn({"place": "actuator", "curves": late}, FACTORS, 49.0)
-    assert [c["plain"] for c in steps["cells"]] == ["samples after a step of the duty"]
-    assert steps["cells"][0]["knots"].count("M") == 3
-    assert steps["cells"][0]["term_unit"] == "V per unit of duty"
+    (share,) = curves.draw(UnknownEffect("thrust", (slow,)), FACTORS, 49.0).pictures
+    assert share.unit == "%"
+    assert "falls from 0 % at 48 rad/s to −20 % at 52 rad/s" in plain(share.label)
+    (steps,) = curves.draw(UnknownEffect("actuator", tuple(late)), FACTORS, 49.0).pictures
+    assert steps.variable.phrase == "samples after a step of the duty"
+    assert steps.knots.count("M") == 3
+    assert steps.unit == "V per unit of duty"
 
 
 def test_a_curve_over_time_ends_with_the_data():
-    made = curves.drawn({"place": "arm", "curves": [
-        of("t", [0.0, 20.0, 40.0, 60.0, 70.0], [1.0, 2.0, 4.0, 0.0, 0.0]), of("theta", [], [])]}, FACTORS, 49.0)
-    assert len(made["cells"]) == 1
-    assert plain(made["cells"][0]["words"]) == "Rises from 0 rad/s² at 0 s to 3.0 rad/s² at 49 s."
-    assert curves.drawn({"place": "arm", "curves": []}, FACTORS, 49.0) is None
+    over_time = of("t", [0.0, 20.0, 40.0, 60.0, 70.0], [1.0, 2.0, 4.0, 0.0, 0.0])
+    (made,) = curves.draw(UnknownEffect("arm", (over_time, of("theta", [], []))), FACTORS, 49.0).pictures
+    assert plain(made.text) == "Rises from 0 rad/s² at 0 s to 3.0 rad/s² at 49 s."
+    assert curves.draw(UnknownEffect("arm", ()), FACTORS, 49.0) is None
 
 
 @pytest.mark.parametrize(("y", "text"), [
@@ -308,7 +307,7 @@ def test_a_curve_over_time_ends_with_the_data():
     ([4, 3, 2, 1, 0, 1, 2, 3, 4], "dips at 0 V near 0 A, from 4.0 V at −2.0 A to 4.0 V at 2.0 A"),
 ])
 def test_shapes_in_words(y, text):
-    assert plain(curves._words(NINE, np.array(y, dtype=float), "A", "V")) == text
+    assert plain(curves._shape(NINE, np.array(y, dtype=float), "A", "V")) == text
 
 
 def test_regions_are_marked_where_the_misfit_is_drawn(several, nominal):
@@ -317,7 +316,7 @@ def test_regions_are_marked_where_the_misfit_is_drawn(several, nominal):
     page = Page(rendered(several))
     marked = [a for a in page.all("rect") if a.get("class") == "range"]
     assert len(marked) == len(regions)
-    assert all(0.0 <= float(a["x"]) <= float(a["x"]) + float(a["width"]) <= report_page.WIDTH + 0.2 for a in marked)
+    assert all(0.0 <= float(a["x"]) <= float(a["x"]) + float(a["width"]) <= drawing.WIDTH + 0.2 for a in marked)
     said = [a["aria-label"] for a in page.all("svg") if a.get("aria-label", "").startswith("Misfit")]
     assert len(said) == 6
     assert sum("stands out" in text for text in said) == len(regions)
@@ -393,7 +392,7 @@ def test_a_number_that_moved_is_marked(friction):
     marked = [text for stack, text in page.texts if stack[-2:] == ("td", "span")]
     assert "+20\N{NO-BREAK SPACE}%" in marked
     off = [a for tag, a, stack in page.tags if a.get("class") == "off"]
-    assert len(off) == 1 + sum(abs(n["value"] / n["nominal"] - 1.0) > report_page.OFF
+    assert len(off) == 1 + sum(abs(n["value"] / n["nominal"] - 1.0) > parameters.OFF
                                for name, n in numbers.items() if name not in moved)
 
 
@@ -470,16 +469,16 @@ def test_every_stretch_keeps_its_least_and_greatest():
     x = np.random.default_rng(1).standard_normal(10_007)
     x[[500, 5000]] = 99.0, -99.0
     x[2000:3000] = np.nan
-    drawn = report_page._least_and_greatest(x, 400)
+    drawn = drawing.least_and_greatest(x, 400)
     assert len(drawn) == 400
     assert (np.nanmax(drawn), np.nanmin(drawn)) == (99.0, -99.0)
     assert 30 <= np.isnan(drawn).sum() <= 40
-    assert report_page._least_and_greatest(x, 20_000) is x
+    assert drawing.least_and_greatest(x, 20_000) is x
 
 
 def test_packed_values_come_back():
     x = np.concatenate([np.linspace(-3.0, 5.0, 1001), [np.nan]])
-    packed = report_page._packed(x)
+    packed = traces._packed(x)
     steps = np.frombuffer(base64.b64decode(packed["data"]), "<i2").astype(float)
     back = np.where(steps == -32768, np.nan, packed["low"] + (steps + 32767) * packed["scale"])
     assert np.nanmax(np.abs(back - x)) <= 8.0 / 65534 / 2 * 1.001
@@ -488,5 +487,5 @@ def test_packed_values_come_back():
 
 
 def test_a_path_has_gaps_where_values_are_missing():
-    drawn = report_page._path(np.array([0.0, 1.0, np.nan, 1.0, 0.0]), 0.0, 1.0)
+    drawn = drawing.path(np.array([0.0, 1.0, np.nan, 1.0, 0.0]), 0.0, 1.0)
     assert drawn == "M0 400l0 0 400-400M1200 0l0 0 400 400"

@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The free curves of something outside the catalogue, as pictures with their knots and a plain sentence each."""
+"""The section on an unknown effect: its free curves as pictures with their knots, and a plain sentence each."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis.report.number_format import marks, quantity, with_unit
+from aeropend_ident.diagnosis.diagnosis import Diagnosis
+from aeropend_ident.diagnosis.document import Curve, DiagnosisDocument, UnknownEffect
+from aeropend_ident.diagnosis.report.binned import variable
+from aeropend_ident.diagnosis.report.drawing import HEIGHT, WIDTH, from_top, grid
+from aeropend_ident.diagnosis.report.number_format import Tick, quantity, ticks, with_unit
+from aeropend_ident.diagnosis.report.variables import VARIABLES, Variable
 
 Array = NDArray[np.float64]
-
-WIDTH, HEIGHT = 1600, 400
-"""Units of a drawing, stretched to whatever size the page gives it."""
 
 TERMS = {
     ("actuator", "V"): "voltage", ("electrical", "V"): "voltage in the winding",
@@ -27,46 +28,89 @@ TERMS = {
 }
 """What is missing, by place and unit; positive where it drives or lifts."""
 
-VARIABLES = {
-    "theta": ("θ", "the arm angle", "rad"), "theta_dot": ("θ̇", "the arm rate", "rad/s"),
-    "omega": ("ω", "the rotor speed", "rad/s"), "i_a": ("i_a", "the armature current", "A"),
-    "duty": ("τ", "the duty", ""), "t": ("t", "time", "s"),
-    "omega, slowly": ("", "the rotor speed of the last seconds", "rad/s"),
-    "slope of omega": ("", "the slope of the rotor speed", "rad/s²"),
-    "steps": ("", "samples after a step of the duty", ""),
-}
-"""Symbol, plain name and unit of what a curve is drawn over."""
-
 LATE = re.compile(r"step of the duty, (\d+) samples? ago")
+"""Variable of a curve that belongs to a single step of the duty."""
+
 NOTHING = 0.1
-"""A curve that does less than this share of what the strongest does is called flat."""
+"""Share of the effect of the strongest curve below which another one is called next to nothing (choice)."""
 
 JUMP = 0.55
-"""Share of a curve's height between two neighbouring knots that is told."""
+"""Share of a curve's height between two neighbouring knots from which the text mentions them (choice)."""
+
+STEP = 1e-3
+"""Change of the duty between two samples from which it is a step (choice)."""
 
 
 @dataclass(frozen=True)
 class Factors:
-    """RMS over the recording of what a curve is multiplied by, by what its name says in brackets, and of duty steps."""
+    """What curves are multiplied by: RMS over the recordings.
+
+    Attributes:
+        thrust: [rad/s^2] of the thrust, as acceleration of the arm.
+        rate: [rad/s] of the rate of the arm.
+        current: [A] of the current.
+        step: of the steps of the duty.
+    """
 
     thrust: float
     rate: float
     current: float
     step: float
 
-    def of(self, said: str) -> float:
-        """The factor of a curve whose name ends like this; 1 if nothing is said."""
-        return {"share of the thrust": self.thrust, "damping": self.rate, "resistance": self.current}.get(said, 1.0)
+    def of(self, name: str) -> float:
+        """The factor with this name in the brackets of a curve; 1 for any other name."""
+        return {"share of the thrust": self.thrust, "damping": self.rate, "resistance": self.current}.get(name, 1.0)
+
+
+@dataclass(frozen=True)
+class CurvePicture:
+    """A free curve as the page draws it.
+
+    Attributes:
+        variable: what it is drawn over.
+        term: what its values are.
+        unit: of the values.
+        text: its shape in a sentence.
+        label: what the picture shows, in words.
+        curve: its path.
+        knots: path of its knots.
+        ticks: of the vertical axis.
+        marks: ticks of the horizontal axis.
+        grid: path of the grid.
+    """
+
+    variable: Variable
+    term: str
+    unit: str
+    text: str
+    label: str
+    curve: str
+    knots: str
+    ticks: list[Tick]
+    marks: list[Tick]
+    grid: str
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """The content of the section; `pictures`: the curve that does most comes first."""
+
+    place: str
+    pictures: list[CurvePicture]
 
 
 @dataclass(frozen=True)
 class _Curve:
-    """A curve as it is drawn: knots x and values y (K,), without the straight line that a number does as well.
+    """A curve as it is drawn, without the straight line that a parameter of the model does as well.
 
     Attributes:
-        name, unit: as in `diagnosis.json`.
-        line: that straight line (K,), 0 where no number of the model does as well.
-        amount: RMS of what the curve does in the recording, in units of the place. slant: of what the line does.
+        name: as in the document.
+        unit: as in the document.
+        x: (K,) knots.
+        y: (K,) values.
+        line: (K,) that straight line, 0 where no parameter does as well.
+        amount: RMS of what the curve does in the recording, in units of the place.
+        slant: the same of the line.
     """
 
     name: str
@@ -78,15 +122,34 @@ class _Curve:
     slant: float = 0.0
 
 
-def drawn(unknown: Mapping[str, Any], factors: Factors, fitted: float) -> dict[str, Any] | None:
-    """What the page needs to draw the term; None where there is no curve.
+def section(diagnosis: Diagnosis, document: DiagnosisDocument) -> Unknown | None:
+    """The content of the section; None if there is no unknown effect.
 
     Args:
-        unknown: `place` and `curves`, as in `diagnosis.json`.
-        factors: what multiplies the curves.
-        fitted: s, end of the data they were fitted to; nothing holds a curve over time beyond it.
+        diagnosis: the diagnosis.
+        document: its document.
     """
-    curves = [c for c in (_curve(row, factors, fitted) for row in _rows(unknown["curves"])) if c is not None]
+    unknown = document.which.unknown
+    if unknown is None:
+        return None
+    n = diagnosis.augmented.model
+    speed, current = (np.concatenate([np.asarray(r[c]) for r in diagnosis.after]) for c in ("omega", "i_a"))
+    rate = np.concatenate([variable(s, "theta_dot") for s in diagnosis.signals])
+    step = np.concatenate([np.diff(s.duty) for s in diagnosis.signals])
+    factors = Factors(n["L_over_J"] * n["k_thrust"] * _rms(speed**2), _rms(rate), _rms(current),
+                      _rms(step[np.abs(step) > STEP]))
+    return draw(unknown, factors, max(s.train * s.period for s in diagnosis.signals))
+
+
+def draw(unknown: UnknownEffect, factors: Factors, fitted: float) -> Unknown | None:
+    """Draw the curves; None if there is none to draw.
+
+    Args:
+        unknown: the effect.
+        factors: what multiplies the curves.
+        fitted: [s] end of the fitted data; nothing determines a curve over time after it.
+    """
+    curves = [c for c in (_curve(row, factors, fitted) for row in _rows(unknown.curves)) if c is not None]
     if not curves:
         return None
     curves.sort(key=lambda c: -c.amount)
@@ -96,21 +159,26 @@ def drawn(unknown: Mapping[str, Any], factors: Factors, fitted: float) -> dict[s
         alike = [c for c in curves if c.unit == unit]
         share = max(c.amount for c in alike) / most if most > 0.0 else 1.0
         spans[unit] = max(float(np.ptp(np.append(c.y, 0.0))) for c in alike) * max(1.0, 0.5 / max(share, 1e-6))
-    return {"place": unknown["place"], "cells": [_cell(c, unknown["place"], spans[c.unit], most) for c in curves]}
+    return Unknown(unknown.place, [_picture(c, unknown.place, spans[c.unit], most) for c in curves])
 
 
-def _rows(curves: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, Array, Array]]:
+def _rms(x: Array) -> float:
+    x = x[np.isfinite(x)]
+    return float(np.sqrt(np.mean(x**2))) if len(x) else 0.0
+
+
+def _rows(curves: Sequence[Curve]) -> list[tuple[str, str, Array, Array]]:
     """Name, unit, knots (K,) and values (K,) of each curve; those of single steps of the duty as one over their age."""
     rows, ages, heights, unit = [], [], [], ""
     for c in curves:
-        x, y = np.asarray(c["at"], dtype=float), np.asarray(c["value"], dtype=float)
-        late = LATE.fullmatch(c["variable"])
+        x, y = np.asarray(c.at, dtype=float), np.asarray(c.value, dtype=float)
+        late = LATE.fullmatch(c.variable)
         if late and len(y):
             ages.append(float(late[1]))
             heights.append(float(y[-1] - y[0]) if len(y) > 1 else float(y[0]))
-            unit = f"{c['unit']} per unit of duty"
+            unit = f"{c.unit} per unit of duty"
         elif len(x) == len(y) > 1:
-            rows.append((c["variable"], c["unit"], x, y))
+            rows.append((c.variable, c.unit, x, y))
     if len(ages) > 1:
         rows.append(("steps", unit, np.array(ages), np.array(heights)))
     return rows
@@ -118,16 +186,16 @@ def _rows(curves: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, Array, Ar
 
 def _curve(row: tuple[str, str, Array, Array], factors: Factors, fitted: float) -> _Curve | None:
     name, unit, x, y = row
-    variable, _, said = name.partition(" (")
-    factor = factors.step if variable == "steps" else factors.of(said.rstrip(")"))
-    if variable == "t":
+    over, _, factor_name = name.partition(" (")
+    factor = factors.step if over == "steps" else factors.of(factor_name.rstrip(")"))
+    if over == "t":
         inside = x < fitted
         if 0 < inside.sum() < len(x):
             x, y = np.append(x[inside], fitted), np.append(y[inside], y[inside][-1])
     if len(x) < 2 or not np.isfinite(y).all():
         return None
     line = np.zeros(len(x))
-    if variable == "steps":
+    if over == "steps":
         return _Curve(name, unit, x, y, line, factor * float(np.sqrt(np.mean(y**2))))
     weight = np.ones(len(x))  # knots are quantiles: each stands for the same share of the time
     weight[[0, -1]] = 0.5
@@ -135,15 +203,16 @@ def _curve(row: tuple[str, str, Array, Array], factors: Factors, fitted: float) 
     def amount(z: Array) -> float:
         return factor * float(np.sqrt(np.average((z - np.average(z, weights=weight))**2, weights=weight)))
 
-    if not said and variable != "t":
+    if not factor_name and over != "t":
         line = np.asarray(np.polyval(np.polyfit(x, y, 1, w=np.sqrt(weight)), x), dtype=np.float64)
-    bend = y - line  # constants move freely between curves and numbers: drawn from where the variable is zero
+    # constants move freely between curves and parameters: drawn from where the variable is zero
+    bend = y - line
     return _Curve(name, unit, x, bend - np.interp(np.clip(0.0, x[0], x[-1]), x, bend), line, amount(bend), amount(line))
 
 
-def _cell(c: _Curve, place: str, span: float, most: float) -> dict[str, Any]:
-    variable = c.name.partition(" (")[0]
-    symbol, plain, unit = VARIABLES.get(variable, ("", variable, ""))
+def _picture(c: _Curve, place: str, span: float, most: float) -> CurvePicture:
+    over = c.name.partition(" (")[0]
+    v = VARIABLES.get(over, Variable("", over, "", article=False))
     term = TERMS.get((place, c.unit.partition(" ")[0]), "what is missing")
     low, high = float(min(c.y.min(), 0.0)), float(max(c.y.max(), 0.0))
     room = 0.5 * max(span - (high - low), 0.0) + 0.1 * span or 0.5
@@ -152,29 +221,33 @@ def _cell(c: _Curve, place: str, span: float, most: float) -> dict[str, Any]:
 
     points = [f"{WIDTH * (a - left) / (right - left):.0f} {HEIGHT * (high - b) / (high - low):.0f}"
               for a, b in zip(c.x, c.y, strict=True)]
-    scale, shown = _scale(max(-low, high), c.unit)
-    words = "next to nothing" if c.amount < NOTHING * most else _words(c.x, scale * c.y, unit, shown)
+    scale, unit = _scale(max(-low, high), c.unit)
+    text = "next to nothing" if c.amount < NOTHING * most else _shape(c.x, scale * c.y, v.unit, unit)
     if c.slant > NOTHING * most:
-        rise = quantity(scale * float(c.line[-1] - c.line[0]), shown, 2)
-        words += f"; besides, a slope by {rise} in all, which the model's numbers may do as well"
-    ticks = [{"at": 100.0 - m["at"], "text": m["text"]} for m in marks(scale * low, scale * high, 5)]
-    return {"symbol": symbol, "plain": plain, "unit": unit, "term": term, "term_unit": shown,
-            "words": f"{words[:1].upper()}{words[1:]}.",
-            "said": f"{term} against {plain}, a curve with {len(c.x)} knots: {words}",
-            "curve": "M" + "L".join(points), "knots": "".join(f"M{p}h0" for p in points),
-            "ticks": ticks, "marks": marks(left, right, 4),
-            "grid": "".join(f"M0 {HEIGHT * m['at'] / 100.0:.0f}h{WIDTH}" for m in ticks)}
+        rise = quantity(scale * float(c.line[-1] - c.line[0]), unit, 2)
+        text += f"; besides, a slope by {rise} in all, which the model's numbers may do as well"
+    marks = from_top(ticks(scale * low, scale * high, 5))
+    return CurvePicture(v, term, unit, f"{text[:1].upper()}{text[1:]}.",
+                        f"{term} against {v.phrase}, a curve with {len(c.x)} knots: {text}", "M" + "L".join(points),
+                        "".join(f"M{p}h0" for p in points), marks, ticks(left, right, 4), grid(marks))
 
 
 def _scale(most: float, unit: str) -> tuple[float, str]:
-    """What values are multiplied by for an axis with short marks, and the unit of that axis."""
+    """Factor on the values that makes the texts of an axis short, and the unit of that axis."""
     if unit == "-":
         return 100.0, "%"
     return (1e3, f"m{unit}") if most < 0.05 and unit in {"N·m", "V", "A", "rad", "Ω"} else (1.0, unit)
 
 
-def _words(x: Array, y: Array, x_unit: str, y_unit: str) -> str:
-    """The shape of a curve (K,) in words: from where to where, jumps, extremes."""
+def _shape(x: Array, y: Array, x_unit: str, y_unit: str) -> str:
+    """The shape of a curve in words: its ends, jumps, extremes.
+
+    Args:
+        x: (K,) knots.
+        y: (K,) values.
+        x_unit: of the knots.
+        y_unit: of the values.
+    """
     steps, span = np.diff(y), float(np.ptp(y))
 
     def at(k: int) -> str:
@@ -203,5 +276,5 @@ def _words(x: Array, y: Array, x_unit: str, y_unit: str) -> str:
 
 
 def _rounded(value: float, span: float, unit: str) -> str:
-    """A value to two digits; 0 where it is next to nothing beside the span."""
+    """A value to two digits; 0 if it is below 2 % of the span."""
     return with_unit("0", unit) if abs(value) < 0.02 * span else quantity(value, unit, 2)

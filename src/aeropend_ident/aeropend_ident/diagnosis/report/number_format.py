@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers as a person reads them: digits that count, units, intervals, shares, and marks along an axis."""
+"""Numbers as a person reads them: digits that count, units, intervals, shares, and ticks along an axis."""
 
 from __future__ import annotations
 
 import math
 import re
-from typing import Any
+from typing import NamedTuple
 
 
 def quantity(value: float | None, unit: str = "", digits: int = 3) -> str:
@@ -94,11 +94,24 @@ def ends(low: float, high: float) -> list[str]:
     return [fixed(x, 0, decimals) for x in (low, high)]
 
 
-def marks(low: float, high: float, about: int) -> list[dict[str, Any]]:
-    """Round values within low..high: where (percent of the way) and as text."""
+class Tick(NamedTuple):
+    """A round value on an axis: its position in percent of the way from low to high, and its text."""
+
+    at: float
+    text: str
+
+
+def ticks(low: float, high: float, about: int) -> list[Tick]:
+    """Round values on an axis.
+
+    Args:
+        low: value at its lower end.
+        high: value at its upper end.
+        about: number of ticks, roughly.
+    """
     raw = (high - low) / about
     base = 10.0 ** math.floor(math.log10(raw))
     step = next(m * base for m in (1.0, 2.0, 5.0, 10.0) if m * base >= raw * 0.999)
     decimals = max(0, -math.floor(math.log10(step) + 1e-9))
-    return [{"at": 100.0 * (k * step - low) / (high - low), "text": fixed(k * step, 0, decimals)}
+    return [Tick(100.0 * (k * step - low) / (high - low), fixed(k * step, 0, decimals))
             for k in range(math.ceil(low / step), math.floor(high / step) + 1)]

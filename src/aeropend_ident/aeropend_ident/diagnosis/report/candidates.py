@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The section on the effects: the candidates, the pairs that stay open, and the next experiment."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+
+from aeropend_ident.diagnosis.document import Candidate, DiagnosisDocument, NextExperiment
+from aeropend_ident.diagnosis.report.number_format import interval, minus, with_unit
+from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
+from aeropend_sim.model.parameters import PARAMETERS
+
+PROBABLE = 0.01
+"""Probability from which a candidate is always visible (choice)."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter of an effect, as texts: its name, its value with the unit, and the interval."""
+
+    name: str
+    value: str
+    between: str
+
+
+@dataclass(frozen=True)
+class CandidateRow:
+    """A candidate as it is shown.
+
+    Attributes:
+        effect: its id.
+        parameter: of the model, if that is what is off; "" for an effect.
+        place: where it acts.
+        physics: what it is, in words.
+        probability: [0..1] among its rivals.
+        estimates: of its parameters.
+        gap_after: [share of the spread] total gap with it; None if it was not computed.
+        found: whether it is part of the verdict.
+    """
+
+    effect: str
+    parameter: str
+    place: str
+    physics: str
+    probability: float
+    estimates: list[Estimate]
+    gap_after: float | None
+    found: bool
+
+    @property
+    def name(self) -> str:
+        """The parameter or the effect."""
+        return self.parameter or self.effect
+
+
+@dataclass(frozen=True)
+class Advice:
+    """The next experiment: the reason, and the command ("" if there is none)."""
+
+    why: str
+    command: str
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The content of the section.
+
+    Attributes:
+        shown: rows that are always visible.
+        others: rows that a click shows.
+        not_separable: pairs of names.
+        advice: the next experiment.
+    """
+
+    shown: list[CandidateRow]
+    others: list[CandidateRow]
+    not_separable: tuple[tuple[str, str], ...]
+    advice: Advice | None
+
+
+def rows(document: DiagnosisDocument) -> list[CandidateRow]:
+    """All candidates."""
+    return [_row(c) for c in document.which.candidates]
+
+
+def section(document: DiagnosisDocument, candidates: list[CandidateRow]) -> Candidates:
+    """The content of the section.
+
+    Args:
+        document: of the diagnosis.
+        candidates: all rows.
+    """
+    shown = [c for c in candidates if c.found or c.probability >= PROBABLE]
+    which = document.which
+    return Candidates(shown, [c for c in candidates if c not in shown], which.not_separable,
+                      None if which.next_experiment is None else _advice(which.next_experiment))
+
+
+def _row(c: Candidate) -> CandidateRow:
+    parameter = next(iter(c.parameters), "") if c.effect == PARAMETER_MISMATCH else ""
+    estimates = []
+    for name, q in c.parameters.items():
+        value, between = interval(q.value, q.low, q.high)
+        unit = PARAMETERS[f"model.{name}"].unit if parameter else CATALOGUE[c.effect].parameters[name].unit
+        estimates.append(Estimate(name, with_unit(value, unit), between))
+    physics = minus(f"{PARAMETERS[f'model.{parameter}'].description}; its value is off" if parameter
+                    else CATALOGUE[c.effect].physics)
+    return CandidateRow(c.effect, parameter, c.place, physics, c.probability, estimates, c.gap_after, c.found)
+
+
+def _advice(experiment: NextExperiment) -> Advice:
+    settings = [f"-p {shlex.quote(f'{name}:={_ros(value)}')}" for name, value in experiment.excite.items()]
+    return Advice(experiment.why, " ".join(["excite --ros-args", *settings]) if settings else "")
+
+
+def _ros(value: object) -> str:
+    """A value as a ROS parameter on the command line."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"[{', '.join(map(_ros, value))}]" if isinstance(value, tuple) else str(value)
