@@ -77,8 +77,8 @@ def test_command_lines_of_a_document_are_understood(path, capsys):
     for line in re.findall(r"^    (?:eval \"\$\()?\.venv/bin/(.+?)\)?\"?$|`\.venv/bin/([^`]+)`", text, re.MULTILINE):
         name, *words = shlex.split("".join(line), comments=True)
         if name == "python":
-            what = f"src/{words[1].partition('.')[0]}/{words[1].replace('.', '/')}.py" if words[0] == "-m" else words[0]
-            assert (ROOT / what).is_file(), line
+            module = f"{words[1].replace('.', '/')}.py"
+            assert (ROOT / module).is_file() or (ROOT / "src" / module.partition("/")[0] / module).is_file(), line
             continue
         told = set(re.findall(r"[\w.-]+", shown(COMMANDS[name], capsys)))
         parameters = [word.partition(":=")[0] for word in words if ":=" in word]
