@@ -484,7 +484,7 @@ class TestProgram:
             (["--effect", "coulomb_fiction"], "coulomb_fiction': give NAME=NUMBER"),
             (["--effect", "coulomb_friction.accl=1"], "unknown parameter of coulomb_friction 'accl'"),
             (["--set", "model.R_a=-1"], "out of range"),
-            (["--fault", "reset"], "say when, as in reset@5"),
+            (["--fault", "reset"], "give its start, as in reset@5"),
             (["--fault", "explode@1"], "fault 'explode@1': give NAME"),
             (["--program", "none.elf"], "build it with 'make -C firmware'"),
             (["--link", "/nowhere/port"], "cannot make the link"),

@@ -39,7 +39,7 @@ struct line {
 
 struct board {
     avr_t *avr;
-    avr_io_t io; // tells of resets
+    avr_io_t io; // reports resets
     avr_timer_t *timer1, *timer4;
     avr_uart_t *uart;
     avr_adc_t *adc;
@@ -503,7 +503,7 @@ static void on_interrupt(avr_irq_t *irq, uint32_t vector, void *param) {
     struct board *b = param;
     const uint64_t now = b->avr->cycle;
     (void)irq;
-    if (b->avr->interrupts.running_ptr == b->depth) { // simavr tells before it counts one in, and after it counts it out
+    if (b->avr->interrupts.running_ptr == b->depth) { // simavr reports before it counts an interrupt in, and after it counts it out
         if (b->depth < 8)
             b->running[b->depth++] = (typeof(b->running[0])){(uint8_t)vector, now};
         const uint32_t waited = (uint32_t)(now - b->rx_since) + INTERRUPT_ENTRY;

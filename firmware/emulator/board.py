@@ -275,7 +275,7 @@ class Plant(Rig):
         if not self.stuck:
             # the PWM output is high for p + 1 of 1025 us; divider and filter scale 5 V to 2.56 V
             pins.angle = REFERENCE_V * (self._counts(theta) + 1.0) / 1025.0
-            unfiltered = sensing._encoder(state[0, 1], chain) + theta - memory.stage2
+            unfiltered = sensing.encoder_angle(state[0, 1], chain) + theta - memory.stage2
             pins.position = round(self._counts(unfiltered)) % ANGLE_COUNTS
         pins.current = CURRENT_V_PER_A * i_a
         pins.negative = LOW_SIDE_V + LOW_SIDE_OHM * abs(i_a) if duty > 0.0 else 0.0

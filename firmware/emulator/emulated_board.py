@@ -116,9 +116,9 @@ class Fault:
         try:
             start, length, rate = (float(part) if part else None for part in match.groups()[1:])
         except ValueError:
-            raise UsageError(f"fault '{text.strip()}': not a number in it") from None
+            raise UsageError(f"fault '{text.strip()}': it has an invalid number") from None
         if start is None and now is None:
-            raise UsageError(f"fault '{text.strip()}': say when, as in {match[1]}@5")
+            raise UsageError(f"fault '{text.strip()}': give its start, as in {match[1]}@5")
         name = match[1]
         if length is None:
             length = 1.0 if name == "unplug" else float("inf")

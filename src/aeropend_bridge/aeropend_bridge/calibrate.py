@@ -96,7 +96,7 @@ def zeros(base: Calibration, pwm: Sequence[Sample], ssi: Sequence[Sample]) -> tu
     if not everything:
         raise CalibrationError("the board sends no samples: reset it and try again")
     if any(sample.duty for sample in everything):
-        raise CalibrationError("the motor is driven: end what commands it")
+        raise CalibrationError("the motor is driven: end the program that commands it")
     if any(sample.period for sample in everything):
         raise CalibrationError("the propeller turns: wait until it stands")
     found, notes = {}, []

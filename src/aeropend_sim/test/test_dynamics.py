@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The compiled equations against scipy's integrators and a right-hand side written here from the contract's table."""
+"""The compiled equations against scipy's integrators and a right-hand side written here from the table of effects."""
 
 from itertools import pairwise
 
@@ -31,7 +31,7 @@ def defaults(*ids):
 
 
 class Reference:
-    """The plant by the contract's section 4, integrated from one change of the input or of dry friction to the next."""
+    """The plant by the equations of docs/effects.md, integrated between changes of the input or of dry friction."""
 
     def __init__(self, model: Model, method: str = "DOP853", rtol: float = 1e-10) -> None:
         self.n, self.e, self.method, self.rtol = model.numbers(), model.effects, method, rtol

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every effect against the contract's table: it changes what it should and nothing else, and nothing at no size."""
+"""Every effect against a table of its own: it changes what it should and nothing else, and nothing at no size."""
 
 import numpy as np
 import pytest
@@ -78,7 +78,7 @@ def changed(before, after):
     return {name for name in before if not np.array_equal(before[name], after[name])}
 
 
-def test_catalogue_is_the_contracts_table():
+def test_catalogue_is_the_table_of_effects():
     found = {id_: (e.place, ", ".join(f"{name} {p.unit}" for name, p in e.parameters.items()))
              for id_, e in CATALOGUE.items()}
     assert found == CONTRACT

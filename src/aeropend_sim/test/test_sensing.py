@@ -9,11 +9,11 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import brentq
 
-from aeropend_sim.model import sensing
+from aeropend_sim.model import dynamics, sensing
 from aeropend_sim.model.dynamics import simulate
 from aeropend_sim.model.effects import SPIKE_FACTOR
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
-from aeropend_sim.model.rig import record
+from aeropend_sim.model.rig import Sample, record
 
 H = SAMPLE_PERIOD
 STEP = 2.0 * math.pi
@@ -292,3 +292,10 @@ def test_the_reading_of_a_current_and_a_voltage_is_that_of_the_whole_chain():
     assert np.array_equal(sensing.read_voltage(model, v_a), out[V_A])
     assert sensing.true_voltage(model, sensing.read_voltage(model, v_a)) == pytest.approx(v_a)
     assert sensing.read_current(base, 1.5) == 1.5
+
+
+def test_rows_of_readings_and_states_are_named_in_the_order_of_their_tuples():
+    assert sensing.READING._fields == Sample._fields
+    assert dynamics.ROW._fields == dynamics.Trajectory._fields
+    assert [*sensing.READING] == [*range(4)]
+    assert [*dynamics.ROW] == [*range(7)]

@@ -158,8 +158,8 @@ class Observer:
 
 
 @njit(nogil=True)
-def _observe(theta: float, volts: Array, s: dynamics.State, m: sensing.Memory, gain: Array, chain: sensing.Chain,
-             c: dynamics.Coefficients, e: Values | None, x: dynamics.Extra | None
+def _observe(theta: float, volts: Array, s: dynamics.State, m: sensing.Memory, gain: Array,
+             chain: sensing.MeasurementChain, c: dynamics.Coefficients, e: Values | None, x: dynamics.Extra | None
              ) -> tuple[dynamics.State, sensing.Memory, tuple[dynamics.State, float, float, float]]:
     """Correct by a reading, advance over the first of the voltages, and predict over the others."""
     if not math.isnan(theta):
@@ -181,8 +181,8 @@ def _observe(theta: float, volts: Array, s: dynamics.State, m: sensing.Memory, g
 
 
 @njit(nogil=True)
-def _correct_motor(omega: float, i_a: float, s: dynamics.State, known: Array, angles: Array, chain: sensing.Chain,
-                   per_volt: float) -> dynamics.State:
+def _correct_motor(omega: float, i_a: float, s: dynamics.State, known: Array, angles: Array,
+                   chain: sensing.MeasurementChain, per_volt: float) -> dynamics.State:
     """The state after the readings of speed and current; `known` and `angles` (a ring of samples) are updated."""
     k = int(known[MOTOR.samples])
     known[MOTOR.samples] += 1.0
@@ -230,7 +230,7 @@ def _at(angles: Array, k: float) -> float:
     return a + (k - before) * (b - a)
 
 
-def _kalman(chain: sensing.Chain, damping: float, period: float) -> Array:
+def _kalman(chain: sensing.MeasurementChain, damping: float, period: float) -> Array:
     """Gains (5,) of angle, rate, unknown torque and both stages of the angle filter, for an error of the reading."""
     filtered = chain.filter_rate > 0.0
     a = np.zeros((5, 5))

@@ -663,7 +663,7 @@ def steps_in(model: Model, period: float) -> int:
     the result with scipy's integrators for fast plants.
 
     Args:
-        model: numbers and effects.
+        model: parameters and effects.
         period: [s] length of the hold.
     """
     n, e = model.numbers(), values(model.effects)
@@ -691,7 +691,7 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0
     """Coefficients of a model for `run`, `run_arm` and `run_motor`.
 
     Args:
-        model: numbers and effects.
+        model: parameters and effects.
         period: [s] length of a hold.
         steps: steps of a hold; 0: `steps_in` decides.
 
@@ -855,7 +855,7 @@ def simulate(model: Model, duty: Array, period: float = SAMPLE_PERIOD, state: St
     """Simulate the plant for a duty series, each value held for one period.
 
     Args:
-        model: numbers and effects.
+        model: parameters and effects.
         duty: (N,) 0..1.
         period: [s] time between samples.
         state: at the first sample; at rest by default.

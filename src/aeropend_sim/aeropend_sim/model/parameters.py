@@ -74,9 +74,9 @@ PARAMETERS: dict[str, Parameter] = {
     "sensing.current_noise": _P("A", 0.0, 10.0, "standard deviation before quantisation"),
     "sensing.voltage_lsb": _P("V", 0.0, 10.0, "resolution of the voltage; 0 = continuous"),
     "sensing.voltage_noise": _P("V", 0.0, 10.0, "standard deviation before quantisation"),
-    "sensing.speed_pulses_per_rev": _P("-", 0.0, 1e4, "pulses a revolution; 0 = the speed is sampled directly"),
+    "sensing.speed_pulses_per_rev": _P("-", 0.0, 1e4, "pulses per revolution; 0 = the speed is sampled directly"),
     "sensing.speed_tick": _P("s", 0.0, 0.1, "resolution of the pulse times; 0 = continuous"),
-    "sensing.speed_noise": _P("rad/s", 0.0, 1e3, "standard deviation of a speed read"),
+    "sensing.speed_noise": _P("rad/s", 0.0, 1e3, "standard deviation of a speed reading"),
 }
 """All parameters of a model file outside `effects`, as `section.name`."""
 
@@ -157,7 +157,7 @@ def from_flat(flat: Mapping[str, object], name: str = "model", base: Model | Non
     for key, value in flat.items():
         section, _, rest = key.partition(".")
         if key in SECTIONS:
-            raise ModelError(f"{name}: '{key}' is {value!r}; give its numbers by name, one a line")
+            raise ModelError(f"{name}: '{key}' is {value!r}; give its parameters by name, one per line")
         if section == "effects":
             _read_effect(effects, rest, value, name)
         elif key in PARAMETERS:
@@ -168,7 +168,7 @@ def from_flat(flat: Mapping[str, object], name: str = "model", base: Model | Non
     missing = [key for key in PARAMETERS if key not in numbers]
     if missing:
         raise ModelError(f"{name}: {missing[0]} is missing ({len(missing)} in all); "
-                         "a model file gives every number that the presets give")
+                         "a model file gives all parameters that the presets give")
     for id_, parameters in effects.items():
         if id_ != PARAMETER_MISMATCH:
             for key, q in CATALOGUE[id_].parameters.items():

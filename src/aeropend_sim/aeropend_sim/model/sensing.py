@@ -26,7 +26,7 @@ SPEED_TIMEOUT = 0.5
 """[s] Time without a pulse after which the speed reads 0. Convention, as in the firmware (speed.h)."""
 
 
-class Chain(NamedTuple):
+class MeasurementChain(NamedTuple):
     """The measurement chain of a model, precomputed for one sample period, in SI units."""
 
     h: float
@@ -48,6 +48,17 @@ class Chain(NamedTuple):
     tick: float
     speed_noise: float
     spike_rate: float
+
+
+class _Readings(NamedTuple):
+    theta: int = 0
+    omega: int = 1
+    i_a: int = 2
+    v_a: int = 3
+
+
+READING = _Readings()
+"""Row of each channel in an array of readings (4, N)."""
 
 
 class Memory(NamedTuple):
@@ -111,7 +122,7 @@ def angle_filter_tau(model: Model) -> float:
     return model.sensing["angle_filter_tau"] + model.effect("encoder_lag", "tau")
 
 
-def prepare(model: Model, period: float = SAMPLE_PERIOD) -> Chain:
+def prepare(model: Model, period: float = SAMPLE_PERIOD) -> MeasurementChain:
     """The measurement chain of a model, for `read`.
 
     Args:
@@ -121,23 +132,31 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD) -> Chain:
     s, effect = model.sensing, model.effect
     tau = angle_filter_tau(model)
     rate = 1.0 / tau if tau > NO_LAG * period else 0.0
-    return Chain(period, lag(rate, period), rate, effect("angle_offset", "bias"),
-                 effect("encoder_eccentricity", "amplitude"), effect("encoder_eccentricity", "phase"),
-                 s["angle_noise"], s["angle_lsb"], 1.0 + effect("current_gain", "gain"),
-                 effect("current_offset", "bias"), s["current_noise"], s["current_lsb"],
-                 effect("voltage_offset", "bias"), s["voltage_noise"], s["voltage_lsb"],
-                 s["speed_pulses_per_rev"], s["speed_tick"], s["speed_noise"],
-                 effect("speed_spikes", "rate"))
+    return MeasurementChain(
+        h=period, filter=lag(rate, period), filter_rate=rate, bias=effect("angle_offset", "bias"),
+        amplitude=effect("encoder_eccentricity", "amplitude"), phase=effect("encoder_eccentricity", "phase"),
+        angle_noise=s["angle_noise"], angle_lsb=s["angle_lsb"],
+        current_factor=1.0 + effect("current_gain", "gain"), current_bias=effect("current_offset", "bias"),
+        current_noise=s["current_noise"], current_lsb=s["current_lsb"],
+        voltage_bias=effect("voltage_offset", "bias"), voltage_noise=s["voltage_noise"], voltage_lsb=s["voltage_lsb"],
+        pulses=s["speed_pulses_per_rev"], tick=s["speed_tick"], speed_noise=s["speed_noise"],
+        spike_rate=effect("speed_spikes", "rate"))
 
 
 @njit()
-def _encoder(theta: float, c: Chain) -> float:
+def encoder_angle(theta: float, c: MeasurementChain) -> float:
+    """Angle that the encoder measures, before its filter.
+
+    Args:
+        theta: [rad] true angle.
+        c: the chain.
+    """
     angle = theta + c.bias
     return angle + c.amplitude * math.sin(theta + c.phase) if c.amplitude != 0.0 else angle
 
 
 @njit()
-def start(theta: float, theta_dot: float, omega: float, rotor_angle: float, c: Chain) -> Memory:
+def start(theta: float, theta_dot: float, omega: float, rotor_angle: float, c: MeasurementChain) -> Memory:
     """State of the chain when the filter has settled at an angle.
 
     Args:
@@ -147,7 +166,7 @@ def start(theta: float, theta_dot: float, omega: float, rotor_angle: float, c: C
         rotor_angle: [rad] true angle of the rotor.
         c: the chain.
     """
-    angle = _encoder(theta, c)
+    angle = encoder_angle(theta, c)
     return Memory(angle, angle, theta, theta_dot, omega, rotor_angle, math.nan, math.nan, 0.0)
 
 
@@ -157,7 +176,7 @@ def _quantise(x: float, lsb: float) -> float:
 
 
 @njit()
-def filter_angle(m: Memory, theta: float, theta_dot: float, c: Chain) -> tuple[float, float]:
+def filter_angle(m: Memory, theta: float, theta_dot: float, c: MeasurementChain) -> tuple[float, float]:
     """Both stages of the angle filter after one period. Between the samples the angle is a Hermite cubic.
 
     Args:
@@ -166,11 +185,11 @@ def filter_angle(m: Memory, theta: float, theta_dot: float, c: Chain) -> tuple[f
         theta_dot: [rad/s] true rate.
         c: the chain.
     """
-    now = _encoder(theta, c)
+    now = encoder_angle(theta, c)
     if c.filter_rate == 0.0:
         return now, now
-    before = _encoder(m.theta, c)
-    middle = _encoder(0.5 * (m.theta + theta) + 0.125 * c.h * (m.theta_dot - theta_dot), c)
+    before = encoder_angle(m.theta, c)
+    middle = encoder_angle(0.5 * (m.theta + theta) + 0.125 * c.h * (m.theta_dot - theta_dot), c)
     k, a = c.filter, c.filter_rate
     half = k.half_decay * m.stage1 + a * (k.u0 * before + k.u1 * middle + k.u2 * now)
     stage1 = k.decay * m.stage1 + a * (k.w0 * before + k.w1 * middle + k.w2 * now)
@@ -179,7 +198,7 @@ def filter_angle(m: Memory, theta: float, theta_dot: float, c: Chain) -> tuple[f
 
 
 @njit(nogil=True)
-def angle_reading(theta: Array, theta_dot: Array, c: Chain) -> Array:
+def angle_reading(theta: Array, theta_dot: Array, c: MeasurementChain) -> Array:
     """Reading of the angle before noise and quantisation.
 
     Args:
@@ -201,7 +220,7 @@ def angle_reading(theta: Array, theta_dot: Array, c: Chain) -> Array:
 
 
 @njit()
-def time_pulses(m: Memory, omega: float, rotor_angle: float, uniform: Array, normal: float, c: Chain
+def time_pulses(m: Memory, omega: float, rotor_angle: float, uniform: Array, normal: float, c: MeasurementChain
                 ) -> tuple[float, float, float]:
     """Speed from the pulses since the last sample.
 
@@ -241,7 +260,8 @@ def time_pulses(m: Memory, omega: float, rotor_angle: float, uniform: Array, nor
 
 
 @njit(nogil=True)
-def read(out: Array, truth: Array, normal: Array, uniform: Array, m: Memory, first: bool, c: Chain) -> Memory:
+def read(out: Array, truth: Array, normal: Array, uniform: Array, m: Memory, first: bool, c: MeasurementChain
+         ) -> Memory:
     """Read N states in sequence.
 
     Args:
@@ -268,15 +288,16 @@ def read(out: Array, truth: Array, normal: Array, uniform: Array, m: Memory, fir
                 last, speed, now = time_pulses(m, omega, angle, uniform[k], normal[k, 1], c)
             stage1, stage2 = filter_angle(m, theta, theta_dot, c)
             m = Memory(stage1, stage2, theta, theta_dot, omega, angle, last, speed, now)
-        out[0, k] = _quantise(m.stage2 + c.angle_noise * normal[k, 0], c.angle_lsb)
+        out[READING.theta, k] = _quantise(m.stage2 + c.angle_noise * normal[k, 0], c.angle_lsb)
         if c.pulses > 0.0:
-            out[1, k] = 0.0 if math.isnan(m.speed) else m.speed
+            out[READING.omega, k] = 0.0 if math.isnan(m.speed) else m.speed
         else:
-            out[1, k] = omega + c.speed_noise * normal[k, 1]
+            out[READING.omega, k] = omega + c.speed_noise * normal[k, 1]
             if uniform[k, 0] < -math.expm1(-c.spike_rate * c.h):
-                out[1, k] *= SPIKE_FACTOR[0] + (SPIKE_FACTOR[1] - SPIKE_FACTOR[0]) * uniform[k, 1]
-        out[2, k] = _quantise(c.current_factor * i_a + c.current_bias + c.current_noise * normal[k, 2], c.current_lsb)
-        out[3, k] = _quantise(v_a + c.voltage_bias + c.voltage_noise * normal[k, 3], c.voltage_lsb)
+                out[READING.omega, k] *= SPIKE_FACTOR[0] + (SPIKE_FACTOR[1] - SPIKE_FACTOR[0]) * uniform[k, 1]
+        current = c.current_factor * i_a + c.current_bias
+        out[READING.i_a, k] = _quantise(current + c.current_noise * normal[k, 2], c.current_lsb)
+        out[READING.v_a, k] = _quantise(v_a + c.voltage_bias + c.voltage_noise * normal[k, 3], c.voltage_lsb)
     return m
 
 

@@ -37,7 +37,7 @@ class Usage:
         parser = Parser()
         if self.word:
             parser.add_argument("word", nargs="?", metavar=self.word)
-        parser.add_argument("--ros-args", action="store_true", help="what follows is for ROS")
+        parser.add_argument("--ros-args", action="store_true", help="the arguments after it are for ROS")
         parser.add_argument("--params-file", action="append", metavar="FILE", help="file of parameters")
         for option, meaning, completer in (
             ("-p", "parameter", self._parameters),

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Studies that explain where numbers come from."""
+"""Studies that show the origin of parameters."""
