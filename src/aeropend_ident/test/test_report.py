@@ -402,6 +402,16 @@ def test_missing_channels_are_said(angle_only):
     assert len(page.data()[0]["series"]) == 1 + 3 + 2
 
 
+def test_a_short_free_decay_is_drawn_without_what_it_lacks(angle_only):
+    s = angle_only.signals[0]
+    read = np.arange(len(s)) % 20 == 0
+    still = replace(s, duty=np.zeros(len(s)), theta=np.where(read, s.theta, math.nan))
+    page = Page(rendered(replace(angle_only, signals=[still])))
+    assert len(page.data()[0]["series"]) == 3 + 2
+    assert "duty, applied" not in page.text("main")
+    assert "too few readings for these pictures" in page.text("main")
+
+
 def test_several_recordings_are_told_apart(two):
     page = Page(rendered(two, ["monday", "tuesday"]))
     assert page.text("figcaption") == "mondaytuesday"
@@ -454,7 +464,7 @@ def test_intervals(numbers, texts):
 
 @pytest.mark.parametrize(("share", "text"), [
     (1.0, "100 %"), (0.9996, "> 99.9 %"), (0.994, "99.4 %"), (0.636, "64 %"), (0.0712, "7.1 %"), (0.0004, "< 0.1 %"),
-    (0.0, "0 %"), (-0.2, "−20 %"), (None, "–"),
+    (0.0, "0 %"), (-0.0003, "0 %"), (-0.2, "−20 %"), (None, "–"),
 ])
 def test_percents(share, text):
     assert number_format.percent(share).replace("\N{NO-BREAK SPACE}", " ") == text
@@ -474,6 +484,16 @@ def test_every_stretch_keeps_its_least_and_greatest():
     assert (np.nanmax(drawn), np.nanmin(drawn)) == (99.0, -99.0)
     assert 30 <= np.isnan(drawn).sum() <= 40
     assert drawing.least_and_greatest(x, 20_000) is x
+
+
+def test_readings_that_are_some_samples_apart_are_connected():
+    nothing = math.nan
+    x = np.array([nothing, 1.0, nothing, 3.0, nothing, 5.0, *[nothing] * 12, 9.0, nothing])
+    drawn = drawing.connected(x)
+    assert drawn[:6].tolist()[1:] == [1.0, 2.0, 3.0, 4.0, 5.0]
+    assert np.isnan(drawn[[0, *range(6, 18), -1]]).all()
+    dense = np.array([1.0, 2.0, nothing, nothing, 3.0, 4.0, 5.0])
+    assert drawing.connected(dense) is dense
 
 
 def test_packed_values_come_back():

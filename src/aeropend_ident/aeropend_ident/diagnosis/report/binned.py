@@ -21,7 +21,10 @@ AGAINST = ("theta", "theta_dot", "omega", "i_a", "duty", "t")
 """The variables that errors are drawn against: those of the regions."""
 
 BINS = 24
-"""Bins of a picture (choice: about as many as can be told apart in a picture of this width)."""
+"""Bins of a picture at most (choice: about as many as can be told apart in a picture of this width)."""
+
+SAMPLES_PER_BIN = 40
+"""Samples for one bin in a short recording: both outer 5 % quantiles then have two samples beyond them (choice)."""
 
 FEWEST = 12
 """Samples in a bin below which it is left empty: percentiles of fewer mean little (choice)."""
@@ -101,7 +104,7 @@ def variable(s: Signals, name: str) -> Array:
 
 def varies(x: Array) -> bool:
     """Whether errors can be drawn against x (N,)."""
-    return bool(np.isfinite(x).sum() > 10 * BINS and np.nanmax(x) > np.nanmin(x))
+    return bool(np.isfinite(x).sum() > 6 * SAMPLES_PER_BIN and np.nanmax(x) > np.nanmin(x))
 
 
 def binned(x: Array, before: Array, after: Array) -> Binned:
@@ -113,14 +116,15 @@ def binned(x: Array, before: Array, after: Array) -> Binned:
         after: (N,) errors of the augmented model.
     """
     known = np.isfinite(x) & np.isfinite(before) & np.isfinite(after)
-    out = np.full((4, BINS), np.nan)
+    bins = min(max(int(known.sum()) // SAMPLES_PER_BIN, 1), BINS)
+    out = np.full((4, bins), np.nan)
     if not known.any():
-        return Binned(np.linspace(0.0, 1.0, BINS + 1), *out)
+        return Binned(np.linspace(0.0, 1.0, bins + 1), *out)
     x, before, after = x[known], before[known], after[known]
     low, high = np.percentile(x, [0.5, 99.5])
-    edges = np.linspace(low, high if high > low else low + 1.0, BINS + 1)
+    edges = np.linspace(low, high if high > low else low + 1.0, bins + 1)
     which = np.digitize(x, edges) - 1
-    for b in range(BINS):
+    for b in range(bins):
         mine = which == b
         if mine.sum() >= FEWEST:
             out[0, b] = np.median(before[mine])
@@ -157,12 +161,13 @@ def _runs(known: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def _joined(y: Array) -> str:
+    """A path that has gaps where y (B,) has."""
     return "".join("M" + "L".join(_points(y, a, b)) for a, b in _runs(np.isfinite(y)))
 
 
 def _points(y: Array, a: int, b: int) -> list[str]:
     """Points over the middles of bins a..b; a single bin has one at each end."""
-    width = WIDTH / BINS
+    width = WIDTH / len(y)
     if b - a == 1:
         return [f"{width * (a + edge):.0f} {y[a]:.0f}" for edge in (0.0, 1.0)]
     return [f"{width * (k + 0.5):.0f} {y[k]:.0f}" for k in range(a, b)]

@@ -19,6 +19,9 @@ WIDTH, HEIGHT = 1600, 400
 MARGIN = 0.06
 """Space above and below a line, as a share of its height (choice)."""
 
+GAP = 5.0
+"""Distance between two readings, in their usual distance, from which they are not connected (choice)."""
+
 
 def limits(lines: Iterable[Array], *, around_zero: bool = False) -> tuple[float, float]:
     """Lower and upper end of an axis.
@@ -50,6 +53,22 @@ def least_and_greatest(x: Array, most: int) -> Array:
     low, high = np.fmin.reduceat(x, edges[:-1]), np.fmax.reduceat(x, edges[:-1])
     falling = x[edges[:-1]] > x[edges[1:] - 1]
     return np.column_stack([np.where(falling, high, low), np.where(falling, low, high)]).ravel()
+
+
+def connected(x: Array) -> Array:
+    """The values with straight lines between readings that are some samples apart, as of a slow sensor.
+
+    Args:
+        x: (N,) values, NaN between the readings. Longer gaps stay.
+    """
+    known = np.flatnonzero(np.isfinite(x))
+    apart = np.diff(known)
+    if len(known) < 2 or np.median(apart) == 1.0:
+        return x
+    filled = np.interp(np.arange(len(x)), known, x[known], left=np.nan, right=np.nan)
+    for k in np.flatnonzero(apart > GAP * np.median(apart)):
+        filled[known[k] + 1:known[k + 1]] = np.nan
+    return filled
 
 
 def path(x: Array, low: float, high: float) -> str:

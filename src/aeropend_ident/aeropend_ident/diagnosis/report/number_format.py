@@ -46,6 +46,8 @@ def percent(share: float | None, sign: bool = False) -> str:
         return with_unit("<\N{NO-BREAK SPACE}0.1", "%")
     if not sign and 99.9 < x < 100.0:
         return with_unit(">\N{NO-BREAK SPACE}99.9", "%")
+    if -0.05 < x < 0.0 and not sign:
+        x = 0.0
     text = f"{x:.{int(x != 0.0 and (abs(x) < 10.0 or 99.0 < abs(x) < 100.0))}f}"
     if sign and float(text) == 0.0:
         text = "0"

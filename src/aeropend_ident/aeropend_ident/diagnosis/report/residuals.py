@@ -45,7 +45,6 @@ def section(diagnosis: Diagnosis, document: DiagnosisDocument) -> list[ResidualR
     parts = [held_out(s) for s in diagnosis.signals]
     against = {name: np.concatenate([variable(s, name)[p] for s, p in zip(diagnosis.signals, parts, strict=True)])
                for name in AGAINST}
-    against = {name: x for name, x in against.items() if varies(x)}
     rows = []
     for name, channel in document.channels.items():
         before, after = (np.concatenate([r[name][p] - s.channel(name)[p]
@@ -56,7 +55,8 @@ def section(diagnosis: Diagnosis, document: DiagnosisDocument) -> list[ResidualR
 
 
 def _row(shown: Variable, channel: Channel, against: dict[str, Array], before: Array, after: Array) -> ResidualRow:
-    each = {name: binned(x, before, after) for name, x in against.items()}
+    known = np.isfinite(before) & np.isfinite(after)
+    each = {name: binned(x, before, after) for name, x in against.items() if varies(x[known])}
     largest = [x for errors in each.values() if (x := errors.largest()) is not None]
     reach = 1.15 * max([2.0 * channel.floor, *largest])
     return ResidualRow(shown, quantity(reach, shown.unit, 2), [cell(name, e, reach, shown) for name, e in each.items()],

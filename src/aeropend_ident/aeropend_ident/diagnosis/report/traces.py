@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.diagnosis import Diagnosis
 from aeropend_ident.diagnosis.document import DiagnosisDocument
-from aeropend_ident.diagnosis.report.drawing import from_top, grid, least_and_greatest, limits, path
+from aeropend_ident.diagnosis.report.drawing import connected, from_top, grid, least_and_greatest, limits, path
 from aeropend_ident.diagnosis.report.number_format import Tick, quantity, ticks
 from aeropend_ident.diagnosis.report.variables import VARIABLES, Variable
 from aeropend_ident.signals.signals import Signals
@@ -128,13 +128,13 @@ def _figure(diagnosis: Diagnosis, k: int, document: DiagnosisDocument, figures: 
     s = diagnosis.signals[k]
     part = held_out(s)
     start, stop = part.start * s.period, part.stop * s.period
-    drawings = [_Drawing("duty", "duty", "the duty applied", {"duty": s.duty})]
+    drawings = [_Drawing("duty", "duty", "the duty applied", {"duty": s.duty})] if s.driven else []
     for channel in document.channels:
         if np.isfinite(s.channel(channel)[part]).any():
             drawings += _channel(diagnosis, k, channel, part)
     series: list[Array] = []
     strips = [_strip(drawing, part, max(COLUMNS // figures, FEWEST_COLUMNS), series) for drawing in drawings]
-    most = ZOOM_VALUES // figures // len(series)
+    most = ZOOM_VALUES // figures // max(len(series), 1)
     data = TraceData(start=start, stop=stop, series=[_packed(least_and_greatest(x, most)) for x in series])
     return Figure(document.bags[k], strips, ticks(start, stop, 8), data)
 
@@ -153,7 +153,7 @@ def _channel(diagnosis: Diagnosis, k: int, channel: str, part: slice) -> list[_D
 
 def _strip(drawing: _Drawing, part: slice, columns: int, series: list[Array]) -> Strip:
     """A strip as it is drawn without JavaScript; its lines are added to `series`."""
-    cut = {name: x[part] for name, x in drawing.lines.items()}
+    cut = {name: connected(x[part]) for name, x in drawing.lines.items()}
     low, high = limits(cut.values(), around_zero=drawing.kind == "error")
     lines = [Line(name, len(series) + j, path(least_and_greatest(x, 2 * columns), low, high))
              for j, (name, x) in enumerate(cut.items())]
