@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The motor's and the propeller's numbers from bench tests: steady states and one current step. Pure.
+"""Parameters of the motor and the propeller from bench tests: steady states, and a step of the current.
 
-Every test takes `Rows`, a table of what was read, typed in from a bench or made from the plateaus of a recording, and
-returns `Estimate`s. Where a table's rows carry no uncertainty of their own, it is taken from how they scatter.
+Each test takes `Rows`, a table of readings that was typed in or made from the plateaus of a recording, and returns
+`Estimate`s. If the rows have no standard deviations, the scatter of the rows gives the uncertainty.
 """
 
 from __future__ import annotations
@@ -23,31 +23,31 @@ from aeropend_sim.model import actuator
 from aeropend_sim.model.parameters import PARAMETERS
 
 GEAR = 55.0 / 9.0
-"""The thesis' gear ratio N1/N2: it counts K_q on the propeller's side, k_thrust = K_q (55/9)² (3.3, 3.4)."""
+"""Gear ratio N1/N2 of the thesis. Its K_q refers to the propeller's side: k_thrust = K_q (55/9)² (3.3, 3.4)."""
 
 SURE = 3.0
-"""Standard deviations from which on something is said."""
+"""Number of standard deviations from which on a deviation is reported. Convention: the three-sigma rule."""
 
 SETTLED = 0.01
-"""Change within a plateau, as a share of the channel's range, up to which a reading counts as steady."""
+"""Change within a plateau, as a share of the channel's range, up to which a reading counts as steady. Choice."""
 
 HOLD = 1.0
-"""s that a duty must be held for its plateau to count; what is read is its last half."""
+"""[s] Least length of a plateau of the duty; its last half is used. Choice."""
 
 
 class BenchTestError(ValueError):
-    """A table or a recording from which a bench test cannot be worked out; the message is one line for a person."""
+    """A table or a recording that a bench test cannot use; the message is one line for the user."""
 
 
 @dataclass(frozen=True)
 class Rows:
-    """What was read, row by row, SI.
+    """Readings, row by row, in SI units.
 
     Attributes:
-        name: where from, for messages.
-        columns: (N,) by quantity: t, v_a, i_a, omega, duty, thrust, theta.
-        sigma: (N,) standard deviation by quantity, where it is known.
-        notes: what was noticed while reading.
+        name: of the source, for messages.
+        columns: quantity -> (N,) readings: t, v_a, i_a, omega, duty, thrust, theta.
+        sigma: quantity -> (N,) standard deviations, where they are known.
+        notes: remarks from reading the source.
     """
 
     name: str
@@ -64,14 +64,18 @@ class Rows:
         return len(next(iter(self.columns.values())))
 
     def take(self, *names: str, least: int = 3) -> list[Array]:
-        """Columns by name, then their standard deviations (0: unknown), without rows in which a column is missing.
+        """Columns, then their standard deviations (0: unknown), without rows in which a value is missing.
+
+        Args:
+            *names: of the columns.
+            least: number of rows that are needed.
 
         Raises:
-            BenchTestError: a column is not there, or fewer than `least` rows are left.
+            BenchTestError: a column is missing, or fewer than `least` rows are complete.
         """
         for name in names:
             if name not in self.columns:
-                raise BenchTestError(f"{self.name}: {name} is not in it; it has {', '.join(self.columns)}")
+                raise BenchTestError(f"{self.name}: there is no column {name}; it has {', '.join(self.columns)}")
         table = np.column_stack([self.columns[name] for name in names]
                                 + [self.sigma.get(name, np.zeros(len(self))) for name in names])
         table = table[np.isfinite(table).all(axis=1)]
@@ -82,7 +86,15 @@ class Rows:
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number with its standard deviation. `scatter`: that of a single row. `how`: the estimator, in words."""
+    """An estimate of a parameter.
+
+    Attributes:
+        value: in `unit`.
+        sigma: its standard deviation.
+        unit: SI unit; "-" for none.
+        how: the estimator, in words.
+        scatter: standard deviation of a single row; NaN if there is none.
+    """
 
     value: float
     sigma: float
@@ -93,7 +105,16 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Panel:
-    """Points and the curve through them, for a plot."""
+    """Readings and the fitted curve, for a plot.
+
+    Attributes:
+        title: of the panel.
+        x_label: label of the horizontal axis.
+        y_label: label of the vertical axis.
+        x: (N,) readings.
+        y: (N,) readings.
+        curve: fitted y for given x.
+    """
 
     title: str
     x_label: str
@@ -105,13 +126,14 @@ class Panel:
 
 @dataclass(frozen=True)
 class Found:
-    """What a bench test gives.
+    """The result of a bench test.
 
     Attributes:
-        source: where from. rows: how many were used.
-        numbers: estimates of numbers of the model file, by name.
-        others: what else was worked out, by name.
-        notes: what a person should know.
+        source: name of the table or recording.
+        rows: number of rows that were used.
+        numbers: parameter of the model file -> estimate.
+        others: other quantities -> estimate.
+        notes: remarks for the user.
         panels: for the plot.
     """
 
@@ -124,10 +146,16 @@ class Found:
 
 
 def mean_of(values: Array, unit: str, how: str, sigma: Array | None = None) -> Estimate:
-    """The mean of (N,) rows, its standard deviation, and the rows' scatter.
+    """The mean of rows, its standard deviation, and the scatter of the rows.
 
-    With a standard deviation for each row the mean is weighted, and what the rows scatter beyond it counts for all of
-    them alike (DerSimonian and Laird, Controlled Clinical Trials 7, 1986).
+    With standard deviations the mean is weighted. Scatter beyond them is a variance that all rows have in common
+    (DerSimonian and Laird, Controlled Clinical Trials 7, 1986).
+
+    Args:
+        values: (N,) a value for each row.
+        unit: of the values.
+        how: the estimator, in words.
+        sigma: (N,) standard deviations of the rows; None or 0: unknown.
     """
     scatter = float(np.std(values, ddof=1))
     weights = np.ones(len(values)) / scatter**2 if scatter > 0.0 else np.ones(len(values))
@@ -154,7 +182,7 @@ def blocked_rotor(rows: Rows) -> Found:
     (slope, offset), covariance = np.polyfit(i, v, 1, cov=True) if len(v) > 3 else ((found.value, 0.0), np.eye(2))
     if abs(offset) > SURE * math.sqrt(covariance[1, 1]):
         notes.append(f"v_a is {offset:.2g} V ± {math.sqrt(covariance[1, 1]):.1g} where i_a is 0: a reading is offset, "
-                     f"or the brushes take it; the slope alone gives R_a = {slope:.4g} Ω")
+                     f"or the brushes drop it; the slope alone gives R_a = {slope:.4g} Ω")
     return Found(rows.name, len(v), {"R_a": found}, notes=tuple(notes), panels=(
         Panel("blocked rotor", "i_a / A", "v_a / V", i, v, lambda x: found.value * x),))
 
@@ -162,11 +190,14 @@ def blocked_rotor(rows: Rows) -> Found:
 def current_step(rows: Rows, resistance: Estimate) -> Found:
     """L_a from the current after a step of the voltage, rotor blocked (thesis 4.4.2): i = i_end (1 - exp(-(t - t0)/τ)).
 
-    The table starts at the step or before it; with a column v_a the step's instant is known, otherwise it is fitted.
-    L_a = τ R_a.
+    The table starts at the step or before it. The time of the step is fitted. L_a = τ R_a.
+
+    Args:
+        rows: t and i_a.
+        resistance: R_a.
 
     Raises:
-        BenchTestError: columns or rows are missing, or no rise is to be seen.
+        BenchTestError: columns or rows are missing, or the current does not rise.
     """
     t, i, _, _ = rows.take("t", "i_a", least=6)
     order = np.argsort(t, kind="stable")
@@ -190,7 +221,7 @@ def current_step(rows: Rows, resistance: Estimate) -> Found:
     during = int(np.sum((t > fit.x[2]) & (t < fit.x[2] + 3.0 * tau)))
     notes = []
     if during < 3:
-        notes.append(f"only {during} readings fall within 3 τ of the step: sample faster for a τ to rely on")
+        notes.append(f"only {during} readings fall within 3 τ of the step: sample faster for a reliable τ")
     time_constant = Estimate(tau, tau * spread, "s", "exponential fit")
     inductance = Estimate(tau * resistance.value, tau * resistance.value
                           * math.hypot(spread, resistance.sigma / resistance.value), "H", "τ_e R_a")
@@ -202,10 +233,14 @@ def current_step(rows: Rows, resistance: Estimate) -> Found:
 def blocked_recording(recording: Recording, name: str) -> Found:
     """R_a and L_a from a recording of duty steps with the rotor blocked, by a fit of the current to the voltage.
 
-    The winding, L_a di/dt = v_a - R_a i_a (thesis 3.5 at ω = 0), is run over every hold of the voltage.
+    The model of the winding is L_a di/dt = v_a - R_a i_a (thesis 3.5 at ω = 0).
+
+    Args:
+        recording: the recording.
+        name: of it, for messages.
 
     Raises:
-        BenchTestError: channels are missing, nothing happens, or the rotor turned.
+        BenchTestError: channels are missing, no current flows, or the rotor turned.
     """
     v, i, t = recording.v_a, recording.i_a, recording.t
     for channel in ("v_a", "i_a"):
@@ -247,8 +282,12 @@ def blocked_recording(recording: Recording, name: str) -> Found:
 def steady(rows: Rows, resistance: Estimate) -> Found:
     """K_e from steady states (thesis 4.4.3, Table 4.2), and the load torque: K_e = (v_a - R_a i_a)/ω, K_t = K_e.
 
-    Of the electrical power K_e i_a ω nothing is lost on its way to the shaft, so both constants are one number in SI.
-    The load is k_load ω², with a viscous part B_m ω where the rows show one.
+    The electrical power K_e i_a ω reaches the shaft without loss, so both constants are equal in SI units.
+    The load is k_load ω², plus a viscous part B_m ω if the rows show one.
+
+    Args:
+        rows: v_a, i_a and omega.
+        resistance: R_a.
 
     Raises:
         BenchTestError: columns or rows are missing, or the rotor stood.
@@ -262,7 +301,7 @@ def steady(rows: Rows, resistance: Estimate) -> Found:
     constant = Estimate(constant.value, math.hypot(constant.sigma, by_resistance), constant.unit, constant.how,
                         constant.scatter)
     if constant.value <= 0.0:
-        raise BenchTestError(f"{rows.name}: R_a i_a exceeds v_a, so R_a = {resistance.value:g} Ω cannot be; check it")
+        raise BenchTestError(f"{rows.name}: R_a i_a exceeds v_a, so R_a = {resistance.value:g} Ω is too high; check it")
     torque = constant.value * i
     load = mean_of(torque / w**2, "N·m·s²/rad²", "mean of K_t i_a/ω²",
                    constant.value * np.hypot(di, 2.0 * i / w * dw) / w**2)
@@ -287,10 +326,14 @@ def steady(rows: Rows, resistance: Estimate) -> Found:
 def duty_map(rows: Rows, base: Mapping[str, float]) -> Found:
     """The duty map v = k0 + k1 sqrt(k2 τ + k3) (thesis 4.3), by least squares over the rows above its dead zone.
 
-    One of k1, k2, k3 only scales the others: k1 stays as it is in `base`.
+    Only two of k1, k2 and k3 can be determined: k1 keeps its value in `base`.
+
+    Args:
+        rows: duty and v_a.
+        base: parameters of the base model.
 
     Raises:
-        BenchTestError: columns or rows are missing, or no root goes through them.
+        BenchTestError: columns or rows are missing, or no such map fits them.
     """
     duty, v, _, dv = rows.take("duty", "v_a", least=4)
     if duty.min() < 0.0 or duty.max() > 1.0:
@@ -298,7 +341,7 @@ def duty_map(rows: Rows, base: Mapping[str, float]) -> Found:
     alive = v > SURE * dv
     if np.unique(duty[alive]).size < 4:
         raise BenchTestError(f"{rows.name}: {np.unique(duty[alive]).size} duties give a voltage; the map has three "
-                             "numbers, give at least 4")
+                             "parameters, give at least 4")
     k1 = base["k1"] or float(PARAMETERS["model.k1"].high) * 1e-4
     x, y = duty[alive], v[alive]
 
@@ -317,7 +360,7 @@ def duty_map(rows: Rows, base: Mapping[str, float]) -> Found:
     for name, one in numbers.items():
         p = PARAMETERS[f"model.{name}"]
         if not p.low <= one.value <= p.high:
-            raise BenchTestError(f"{rows.name}: no map of the form k0 + k1 sqrt(k2 τ + k3) goes through its rows "
+            raise BenchTestError(f"{rows.name}: no map of the form k0 + k1 sqrt(k2 τ + k3) fits its rows "
                                  f"({name} = {one.value:.3g})")
     values = {name: one.value for name, one in numbers.items()}
     mse = Estimate(float(np.mean((actuator.voltage(values, x) - y) ** 2)), 0.0, "V²", "mean squared error")
@@ -331,28 +374,29 @@ def thrust_curve(rows: Rows, numbers: Mapping[str, float]) -> Found:
     """Thrust over the voltage (thesis 4.4), its inverse (4.5), and k_thrust = f/ω² with the exponent that fits best.
 
     Args:
-        rows: thrust, or theta (the arm as its own scale: f = (mgd/L) sin θ); and omega, v_a or duty.
-        numbers: the model's numbers, with what other tests have found; they give the speed where it was not read.
+        rows: thrust, or theta (the arm is the scale: f = (mgd/L) sin θ); and omega, v_a or duty.
+        numbers: parameters of the model and of other tests; they give the speed where it was not read.
 
     Raises:
-        BenchTestError: columns or rows are missing, or no thrust was made.
+        BenchTestError: columns or rows are missing, or there is no thrust.
     """
     notes: list[str] = []
     columns, sigma = dict(rows.columns), dict(rows.sigma)
     if "thrust" not in columns:
         if "theta" not in columns:
-            raise BenchTestError(f"{rows.name}: neither thrust nor theta is in it; it has {', '.join(columns)}")
+            raise BenchTestError(f"{rows.name}: there is neither thrust nor theta; it has {', '.join(columns)}")
         weight = numbers["mgd_over_J"] / numbers["L_over_J"]
         columns["thrust"] = weight * np.sin(columns["theta"])
         if "theta" in sigma:
             sigma["thrust"] = weight * np.abs(np.cos(columns["theta"])) * sigma["theta"]
-        notes.append(f"the thrust is what holds the arm: as true as the model's mgd_over_J/L_over_J = {weight:.4g} N")
+        notes.append("the thrust is computed from the angle of the arm: it is as accurate as the model's "
+                     f"mgd_over_J/L_over_J = {weight:.4g} N")
     if "v_a" not in columns and "duty" in columns:
         columns["v_a"] = actuator.voltage(numbers, columns["duty"])
-        notes.append("the voltage is what the model's duty map gives")
+        notes.append("the voltage is computed by the model's duty map")
     if "omega" not in columns and "v_a" in columns:
         columns["omega"] = actuator.speed_at(numbers, columns["v_a"])
-        notes.append("the speed is what the model's motor reaches at that voltage")
+        notes.append("the speed is computed by the model's motor from the voltage")
     every = Rows(rows.name, columns, sigma)
     made = every.where(np.flatnonzero((columns["thrust"] > 0.0) & (columns.get("omega", columns["thrust"]) > 0.0)))
     w, f, dw, df = made.take("omega", "thrust", least=4)
@@ -380,18 +424,28 @@ def thrust_curve(rows: Rows, numbers: Mapping[str, float]) -> Found:
 def thrust_to_voltage(a: float, b: float, c: float) -> tuple[float, float, float, float]:
     """The inverse of f = a v² + b v + c (thesis 4.4) as v = p + q sqrt(r + s f) (4.5): p, q, r, s.
 
+    Args:
+        a: [N/V²] coefficient of v².
+        b: [N/V] coefficient of v.
+        c: [N] constant.
+
     Raises:
-        ValueError: a is not positive, so there is no such inverse.
+        ValueError: a is not positive; there is no such inverse.
     """
     if not a > 0.0:
-        raise ValueError(f"a = {a:g} N/V²: the inverse needs a thrust that grows ever faster")
+        raise ValueError(f"a = {a:g} N/V²: the inverse needs a positive a")
     return -b / (2.0 * a), 1.0 / (2.0 * a), b * b - 4.0 * a * c, 4.0 * a
 
 
 def plateaus(recording: Recording, channels: Sequence[str], name: str) -> Rows:
-    """The steady states of a recording: the mean of every channel over the last half of each hold of the duty.
+    """The steady states of a recording: the mean of each channel over the last half of each hold of the duty.
 
-    A hold counts when it lasts `HOLD` and the two quarters of that half agree within their noise or `SETTLED`.
+    A hold counts if it lasts `HOLD` and the two quarters of its last half agree within their noise or `SETTLED`.
+
+    Args:
+        recording: the recording.
+        channels: that are averaged.
+        name: of the recording, for messages.
 
     Raises:
         BenchTestError: a channel was not measured, or fewer than three holds settled.
@@ -422,21 +476,27 @@ def plateaus(recording: Recording, channels: Sequence[str], name: str) -> Rows:
             rows.append(means)
             sigmas.append(spreads)
     if len(rows) < 3:
-        raise BenchTestError(f"{name}: {len(rows)} holds of the duty settle in {', '.join(channels)} ({unsettled} do "
-                             f"not); hold at least 3 duties, longer: excite --ros-args -p kind:=staircase "
+        raise BenchTestError(f"{name}: {', '.join(channels)} settle in {len(rows)} holds of the duty, and do not in "
+                             f"{unsettled}; hold at least 3 duties for longer: excite --ros-args -p kind:=staircase "
                              f"-p duration:=120.0")
     table, spread = np.array(rows), np.array(sigmas)
     return Rows(name, dict(zip(channels, table.T)), dict(zip(channels, spread.T)))
 
 
 def _step(x: Array) -> float:
-    """The resolution of readings: the least difference between two of them."""
+    """Resolution of readings: the least difference between two of them."""
     values = np.unique(x[np.isfinite(x)])
     return float(np.diff(values).min()) if len(values) > 1 else 0.0
 
 
 def _lines(terms: Array, y: Array, least: float = 0.0) -> tuple[Array, Array]:
-    """Linear least squares and its covariance; the variance of a row is what is left, or `least`."""
+    """Linear least squares, and the covariance of the coefficients.
+
+    Args:
+        terms: (N, P).
+        y: (N,).
+        least: lower limit of the variance of a row, which is estimated from the residuals.
+    """
     p = np.asarray(np.linalg.lstsq(terms, y, rcond=None)[0])
     left = y - terms @ p
     variance = max(float(left @ left) / max(len(y) - len(p), 1), least)

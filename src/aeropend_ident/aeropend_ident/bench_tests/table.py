@@ -13,25 +13,26 @@ from aeropend_ident.tables.units import UnitError, parse
 
 QUANTITIES = {"t": "time", "v_a": "voltage", "i_a": "current", "omega": "omega", "duty": "duty", "theta": "theta",
               "thrust": "force"}
-"""Columns, and what their units are units of."""
+"""Column -> quantity of its unit."""
 
 FORCES = {"N": 1.0, "mN": 1e-3, "gf": 9.80665e-3, "g": 9.80665e-3, "kgf": 9.80665, "kg": 9.80665}
-"""Units of a force, N; those of a mass are what scales show."""
+"""[N] Units of a force; those of a mass are for scales."""
 
 USUAL = {"t": "s", "v_a": "V", "i_a": "A", "theta": "rad", "thrust": "N"}
-"""Units where a table gives none. Of a speed and a duty it must: the thesis' Table 4.3 calls V per RPM "Vs/rad"."""
+"""Unit of a column without one. A speed and a duty need a unit: Table 4.3 of the thesis has V per RPM as "Vs/rad"."""
 
 _NAME = re.compile(r"^\s*([A-Za-z_]+)\s*(?:[\[(]\s*([^\])]*?)\s*[\])])?\s*$")
 
 
 def read_rows(path: Path, columns: str | None = None) -> Rows:
-    """Read a table of any kind that `import` reads.
+    """Read a table in any format that `import` reads.
 
     Args:
-        path: the file. columns: names and units, separated by commas, if the file has none of its own.
+        path: the file.
+        columns: names and units, separated by commas, for a file without a line of names.
 
     Raises:
-        BenchTestError: it cannot be used; one line that says where and why.
+        BenchTestError: the table cannot be used; the message says where and why.
     """
     try:
         table = files.read(path)
@@ -54,18 +55,18 @@ def read_rows(path: Path, columns: str | None = None) -> Rows:
 
 
 def _column(cell: str, path: Path) -> tuple[str, float, float]:
-    """The quantity of a column, the size of its unit, and the number that stands for zero."""
+    """The quantity of a column, the size of its unit, and the reading that means zero."""
     match = _NAME.match(cell)
     name, unit = (match.group(1), match.group(2)) if match else ("", None)
     if name not in QUANTITIES:
-        raise BenchTestError(f"{path}: '{cell.strip()}' names no column; give each a quantity and its unit, as in "
-                             f"'v_a [V],omega [rpm]' ({', '.join(QUANTITIES)}), in the first line or with --columns")
+        raise BenchTestError(f"{path}: '{cell.strip()}' names no column; give each column a quantity and its unit, as "
+                             f"in 'v_a [V],omega [rpm]' ({', '.join(QUANTITIES)}), in the first line or with --columns")
     if unit is None and name not in USUAL:
         raise BenchTestError(f"{path}: {name} needs its unit, as in '{name} [{'rpm' if name == 'omega' else '%'}]'")
     unit = unit or USUAL[name]
     if name == "thrust":
         if unit not in FORCES:
-            raise BenchTestError(f"{path}: '{unit}' is no unit of a thrust: give {', '.join(FORCES)}")
+            raise BenchTestError(f"{path}: '{unit}' is not a unit of thrust; give {', '.join(FORCES)}")
         return name, FORCES[unit], 0.0
     try:
         known = parse(QUANTITIES[name], unit)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bench tests of a rig: `bench_test --blocked-rotor pairs.csv --steady speeds.csv`.
 
-Works out the numbers of the motor and the propeller from tables or recordings, and writes a model file that says where
-each came from. Exit code 0 with numbers, 2 with one line on standard error when the input cannot be used.
+Estimates the parameters of the motor and the propeller from tables or recordings, and writes a model file with the
+source of each. Exit code 0 with results, 2 with one line on standard error when the input cannot be used.
 """
 
 from __future__ import annotations
@@ -31,24 +31,25 @@ FILES = ("bench.yaml", "bench_tests.json", "bench_tests.svg")
 
 TESTS = {
     "blocked-rotor": "R_a, and from a recording L_a: v_a, i_a with the rotor blocked",
-    "current-step": "L_a: t, i_a (and v_a) after a step of the voltage with the rotor blocked",
+    "current-step": "L_a: t, i_a around a step of the voltage with the rotor blocked",
     "steady": "K_e, K_t, k_load, B_m: v_a, i_a, omega in steady states",
     "duty-map": "k0 to k3: duty, v_a",
-    "thrust": "k_thrust: thrust (or theta: the arm weighs it), and omega, v_a or duty",
+    "thrust": "k_thrust: thrust (or theta, from which it is computed), and omega, v_a or duty",
 }
-"""In the order in which they need each other, with what each gives and takes."""
+"""Test -> its results and its columns. A test uses the results of the tests before it."""
 
 Source = Rows | Recording
 
 
 def work_out(sources: Mapping[str, Source], base: Model) -> dict[str, Found]:
-    """Run the bench tests on their sources, by the names of `TESTS`.
+    """Run bench tests.
 
     Args:
-        sources: a table or a recording for each test. base: gives the numbers that no test has found.
+        sources: test (see `TESTS`) -> a table or a recording.
+        base: model with the parameters that no test gives.
 
     Raises:
-        BenchTestError: one of them cannot be worked out.
+        BenchTestError: a source cannot be used.
     """
     found: dict[str, Found] = {}
 
@@ -75,8 +76,8 @@ def work_out(sources: Mapping[str, Source], base: Model) -> dict[str, Found]:
     def step(source: Source) -> Found:
         if isinstance(source, Rows):
             return estimates.current_step(source, known("R_a"))
-        raise BenchTestError(f"{source.path}: a recording with the rotor blocked goes to --blocked-rotor, which gives "
-                             "L_a as well")
+        raise BenchTestError(f"{source.path}: give a recording with the rotor blocked to --blocked-rotor, which "
+                             "estimates L_a as well")
 
     run: dict[str, Callable[[Source], Found]] = {
         "blocked-rotor": blocked,
@@ -93,17 +94,23 @@ def work_out(sources: Mapping[str, Source], base: Model) -> dict[str, Found]:
 
 
 def augmented(base: Model, found: Mapping[str, Found]) -> Model:
-    """The base with what was found.
+    """The base model with the estimated parameters.
 
     Raises:
-        ModelError: a number is out of range.
+        ModelError: a parameter is out of range.
     """
     flat = {f"model.{k}": e.value for one in found.values() for k, e in one.numbers.items()}
-    return from_flat(flat, "what the bench tests gave", base)
+    return from_flat(flat, "the result of the bench tests", base)
 
 
 def provenance(base: Model, found: Mapping[str, Found], command: str) -> str:
-    """Where every number of the model file comes from."""
+    """The source of each parameter of the model file.
+
+    Args:
+        base: model with the other parameters.
+        found: results of the tests.
+        command: the command line.
+    """
     lines = [command, ""]
     for test, one in found.items():
         lines += [f"{k} = {value(e)}: {test} of {one.source}, {one.rows} rows, {e.how}" for k, e in one.numbers.items()]
@@ -111,13 +118,13 @@ def provenance(base: Model, found: Mapping[str, Found], command: str) -> str:
 
 
 def value(e: Estimate) -> str:
-    """A number with its standard deviation and unit."""
+    """An estimate with its standard deviation and unit, as text."""
     unit = "" if e.unit == "-" else f" {e.unit}"
     return f"{e.value:.5g} ± {e.sigma:.2g}{unit}" if e.sigma > 0.0 else f"{e.value:.5g}{unit}"
 
 
 def lines(found: Mapping[str, Found]) -> list[str]:
-    """What was found, for a person."""
+    """The results as text for the terminal."""
     out = []
     for test, one in found.items():
         out.append(f"{test} ({one.source}, {one.rows} rows)")
@@ -136,49 +143,55 @@ def lines(found: Mapping[str, Found]) -> list[str]:
 def document(found: Mapping[str, Found]) -> dict[str, object]:
     """The content of `bench_tests.json`."""
 
-    def told(e: Estimate) -> dict[str, object]:
+    def row(e: Estimate) -> dict[str, object]:
         return {"value": e.value, "sigma": e.sigma, "unit": e.unit, "how": e.how,
                 "scatter": None if math.isnan(e.scatter) else e.scatter}
 
     return {"format": 1, **{test: {"source": one.source, "rows": one.rows, "notes": list(one.notes),
-                                   "numbers": {k: told(e) for k, e in one.numbers.items()},
-                                   "others": {k: told(e) for k, e in one.others.items()}}
+                                   "numbers": {k: row(e) for k, e in one.numbers.items()},
+                                   "others": {k: row(e) for k, e in one.others.items()}}
                             for test, one in found.items()}}
 
 
 EXAMPLES = """tables: CSV with a line of names and units, as in 'v_a [V],i_a [A],omega [rpm]'; quantities: t, v_a, i_a,
-omega, duty, thrust, theta. A recording (folder, .mcap or .db3) gives its steady states.
+omega, duty, thrust, theta. Of a recording (folder, .mcap or .db3) the steady states are used.
 
 examples:
   bench_test --blocked-rotor pairs.csv --steady speeds.csv --out my_bench
   bench_test --blocked-rotor blocked_bag --steady stairs_bag --duty-map stairs_bag --thrust stairs_bag
-  bench_test --thrust scale.tsv --columns 'v_a [V],thrust [N]'      a table without names
+  bench_test --thrust scale.tsv --columns 'v_a [V],thrust [N]'      a table without a line of names
 
-exit codes: 0 numbers were written, 2 the input cannot be used (one line says why), 130 interrupted"""
+exit codes: 0 a model was written, 2 the input cannot be used (one line says why), 130 interrupted"""
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Read the command line; exits with 2 and one line where it is wrong."""
     parser = Parser(prog="bench_test", epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
-                    description="Work out the numbers of motor and propeller from bench tests.")
+                    description="Estimate the parameters of the motor and the propeller from bench tests.")
     for name, about in TESTS.items():
         parser.add_argument(f"--{name}", metavar="TABLE|BAG", help=about)
-    parser.add_argument("--columns", metavar="NAMES", help="names and units of the columns of tables without a line of "
-                        "names")
+    parser.add_argument("--columns", metavar="NAMES", help="names and units of the columns, for tables without a line "
+                        "of names")
     parser.add_argument("--model", default="bench", metavar="PRESET|FILE",
-                        help=f"gives what no test finds: {' or '.join(PRESETS)}, or a model file (default: bench)")
-    parser.add_argument("--namespace", metavar="NS", help="namespace of the rig, when a bag holds several")
+                        help="model with the parameters that no test gives: "
+                             f"{' or '.join(PRESETS)}, or a model file (default: bench)")
+    parser.add_argument("--namespace", metavar="NS", help="namespace of the rig, if the bag has several")
     parser.add_argument("--out", default="bench_test", metavar="DIR",
                         help="folder for the results (default: bench_test)")
-    parser.add_argument("--overwrite", action="store_true", help="replace results that are in the folder already")
+    parser.add_argument("--overwrite", action="store_true", help="replace results that are already in the folder")
     options = parser.parse_args(arguments)
     if not any(getattr(options, name.replace("-", "_")) for name in TESTS):
-        parser.error(f"name at least one test: {', '.join(f'--{name}' for name in TESTS)}")
+        parser.error(f"give at least one test: {', '.join(f'--{name}' for name in TESTS)}")
     return options
 
 
 def source(path: str, columns: str | None, namespace: str | None) -> Source:
     """Read a table, or a recording: a folder, .mcap or .db3.
+
+    Args:
+        path: of the table or the recording.
+        columns: names and units, for a table without a line of names.
+        namespace: of the rig in the recording.
 
     Raises:
         BenchTestError, RecordingError: it cannot be used.
@@ -190,7 +203,7 @@ def source(path: str, columns: str | None, namespace: str | None) -> Source:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Work everything out and write the results.
+    """Run the tests and write the results.
 
     Raises:
         BenchTestError, RecordingError, ModelError, OutputError: the input or the output cannot be used.

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well an input excites a rig: what a recording of it could tell, before one is spent on it.
+"""How well an input excites a rig: how well each coefficient could be identified from a recording.
 
     excitation_quality --model bench --duration 20 --duty-max 0.3       a planned signal
     excitation_quality my_bag --model bench                             a recording
 
-The model says what the rig would do; the Fisher information of the readings says how well each coefficient of its
-equations would be known, and which other terms of the library would explain the same readings (collinearity).
+The rig is simulated by its model. The Fisher information of the readings gives the standard deviation of each
+coefficient, and the other terms of the library that would explain the same readings (collinearity).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from aeropend_sim.model.parameters import PRESETS, SAMPLE_PERIOD, Model, ModelEr
 from aeropend_sim.model.rig import record
 
 EXAMPLES = f"""examples:
-  excitation_quality --duration 20 --duty-max 0.3        a signal of `excite`, before a recording is spent on it
+  excitation_quality --duration 20 --duty-max 0.3        a signal of `excite`, before it is recorded
   excitation_quality --kind steps --model my_rig.yaml
   excitation_quality my_bag                              a recording
 
@@ -43,16 +43,19 @@ SIGNAL = {"duration": "length, s", "duty_min": "least duty", "duty_max": "greate
           "hold_min": "shortest hold, s", "hold_max": "longest hold, s", "rest": "duty 0 between the holds, s"}
 
 POOR = 0.1
-"""Relative 1 sigma of a coefficient from which on an input excites it poorly."""
+"""Relative standard deviation of a coefficient from which on an input excites it poorly. Choice."""
 
 
 @dataclass(frozen=True)
 class Excited:
-    """How well one term of one equation would be known.
+    """How well the coefficient of one term could be identified.
 
     Attributes:
-        equation, term, value: the coefficient. sigma: 1 sigma that the readings would leave.
-        rivals: terms that the readings could not tell from it.
+        equation: state whose derivative the equation gives.
+        term: of the equation.
+        value: the coefficient.
+        sigma: its standard deviation after a fit to the readings.
+        rivals: terms that would explain the readings as well.
     """
 
     equation: str
@@ -68,10 +71,15 @@ class Excited:
 
 
 def planned(model: Model, duty: Array, seed: int = 0) -> Dataset:
-    """What a rig like the model would give for duties (N,), one a sample period.
+    """Simulated readings of a planned input.
+
+    Args:
+        model: of the rig.
+        duty: (N,) duty of each sample period.
+        seed: of the noise.
 
     Raises:
-        RecordingError: nothing would happen.
+        RecordingError: the readings would be constant.
     """
     read, _ = record(model, duty, seed)
     return dataset.from_readings({**read, "duty": duty}, SAMPLE_PERIOD, model.sensing, held_out=0.0,
@@ -82,10 +90,13 @@ def quality(model: Model, data: Dataset, show: Show = nothing) -> list[Excited]:
     """How well the coefficients of a model's equations are excited in a dataset.
 
     Args:
-        model: without effects. data: its readings. show: is told which share of the work is done, about.
+        model: without effects.
+        data: the readings.
+        show: progress display, from 0 to 1.
 
     Raises:
-        RecordingError: the model does not run on it. ModelError: the model has effects.
+        RecordingError: the model diverges on the data.
+        ModelError: the model has effects.
     """
     true = in_library(model)
     names = thesis_terms(data.variables)
@@ -98,10 +109,10 @@ def quality(model: Model, data: Dataset, show: Show = nothing) -> list[Excited]:
     fitter = Fitter(problem.experiment(len(data)), Entries.of(start), 0, floor=1.0)
     every = Entries.candidates(problem.candidates)
     if fitter.run(*fitter.point) is None:
-        raise RecordingError(f"{data.name}: the model runs away on it, so nothing can be said; check the model file")
+        raise RecordingError(f"{data.name}: the model diverges on it, so there is no result; check the model file")
     show(0.1, "fitting the readings")
     fitter.fit(rounds=5)
-    show(0.5, "weighing every term")
+    show(0.5, "testing every term")
     misfit, now, _ = linearise(fitter, every, start.shape)
     sigma = np.sqrt(np.diag(fitter.covariance()))
     rivals = list(alternatives(misfit, every, now))
@@ -118,17 +129,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = Parser(prog="excitation_quality", epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
                     description="How well a planned or recorded input excites each term.")
     parser.add_argument("bag", nargs="?", metavar="BAG",
-                        help="a recording; without it, a signal of `excite` is planned")
+                        help="a recording; without it, a planned signal of `excite` is tested")
     parser.add_argument("--model", default="bench", metavar="PRESET|FILE",
                         help=f"{' or '.join(PRESETS)}, or a model file (default: bench)")
-    parser.add_argument("--namespace", metavar="NS", help="namespace of the rig, when a bag holds several")
+    parser.add_argument("--namespace", metavar="NS", help="namespace of the rig, if the bag has several")
     plan = Excitation()
     parser.add_argument("--kind", choices=KINDS, default=plan.kind,
-                        help="the signal, as of `excite`; default %(default)s")
+                        help="kind of the signal, as in `excite`; default %(default)s")
     for name, meaning in SIGNAL.items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=float, default=getattr(plan, name), metavar="X",
                             help=f"{meaning}; default %(default)s")
-    parser.add_argument("--seed", type=int, default=plan.seed, help="of the signal and the noise; default %(default)s")
+    parser.add_argument("--seed", type=int, default=plan.seed,
+                        help="seed of the signal and of the noise; default %(default)s")
     options = parser.parse_args(arguments)
     try:
         model = load(options.model)

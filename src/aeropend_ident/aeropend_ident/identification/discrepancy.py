@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Discrepancy SINDy: only what must be added to a known model is identified (thesis 5.4)."""
+"""Discrepancy SINDy: only the terms that must be added to a known model are identified (thesis 5.4)."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ Equations = Mapping[str, Mapping[str, float]]
 
 
 def nominal(model: Model) -> dict[str, dict[str, float]]:
-    """The nominal equations, thesis (3.2) to (3.5), as coefficients of terms; the coefficients are the dynamics' own.
+    """The nominal equations, thesis (3.2) to (3.5), with the coefficients of `dynamics`: state -> term -> coefficient.
 
     Raises:
-        ModelError: the model has effects, which are no terms.
+        ModelError: the model has effects, which are not sums of terms.
     """
     if effects := [e for e in model.effects if e != "parameter_mismatch"]:
         raise ModelError(f"{model.name}: discrepancy methods add to the nominal equations, and this model has the "
@@ -31,6 +31,6 @@ def nominal(model: Model) -> dict[str, dict[str, float]]:
 
 
 def in_library(model: Model) -> dict[str, dict[str, float]]:
-    """`nominal` in terms of the thesis' library: the rotor never turns backwards, so ω|ω| is ω²."""
+    """`nominal` in terms of the thesis' library: the rotor does not turn backwards, so ω|ω| is ω²."""
     return {s: {t.replace("omega*abs(omega)", "omega*omega"): x for t, x in terms.items()}
             for s, terms in nominal(model).items()}

@@ -350,8 +350,8 @@ class Problem:
         worst = max(found, key=lambda c: found[c].gap / found[c].floor, default=None)
         if worst is not None and found[worst].gap > EXPLAINED * found[worst].floor:
             times = found[worst].gap / found[worst].floor
-            notes.append(f"the free run misses held-out {worst} by {times:.1f} times its noise: something in it is no "
-                         "sum of these terms")
+            notes.append(f"the free run misses held-out {worst} by {times:.1f} times its noise: these terms cannot "
+                         "describe all of it")
         return HeldOutRun(found, run[1][0][:, : len(d.states)], tuple(notes))
 
     def held_out_misfit(self, fitted: Fitter) -> float:

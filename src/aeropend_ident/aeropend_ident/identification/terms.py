@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The candidate terms of sparse identification: the thesis' library of 31, and terms that a user gives.
+"""The candidate terms of sparse identification: the thesis' library of 31 terms, and terms of the user.
 
 A term is a product of factors: `theta`, `omega^1.8`, `sin(theta)`, `theta_dot*abs(theta_dot)`, or `1`.
-x^n is |x|^n with the sign of x where n is not a whole number.
+If n is not an integer, x^n is |x|^n with the sign of x.
 """
 
 from __future__ import annotations
@@ -30,7 +30,13 @@ class TermError(ValueError):
 
 
 class Factor(NamedTuple):
-    """One factor of a term: the kind of function, the column of its variable, its power (of `POWER` only)."""
+    """One factor of a term.
+
+    Attributes:
+        kind: `POWER`, `SIN`, `COS`, `ABS` or `SIGN`.
+        variable: column of its variable.
+        power: the exponent; used by `POWER` only.
+    """
 
     kind: int
     variable: int
@@ -51,9 +57,9 @@ class Library:
     """Candidate terms over named variables.
 
     Attributes:
-        variables: names of the columns, states first, then inputs.
-        names: of the terms.
-        table: the same for compiled code.
+        variables: names of the columns: states, then inputs.
+        names: names of the terms.
+        table: the terms for compiled code.
     """
 
     variables: tuple[str, ...]
@@ -62,7 +68,11 @@ class Library:
 
     @classmethod
     def of(cls, variables: Sequence[str], names: Sequence[str]) -> Library:
-        """A library of terms by name.
+        """A library of terms.
+
+        Args:
+            variables: names of the columns: states, then inputs.
+            names: names of the terms.
 
         Raises:
             TermError: a term is not understood, names an unknown variable, or is given twice.
@@ -82,7 +92,7 @@ class Library:
         return len(self.names)
 
     def __call__(self, values: Array) -> Array:
-        """The terms (N, terms) for variables (N, len(variables))."""
+        """Values (N, terms) of the terms for variables (N, len(variables))."""
         values = np.ascontiguousarray(values, dtype=float)
         out = np.empty((len(values), len(self)))
         for j, name in enumerate(self.names):
@@ -96,8 +106,12 @@ class Library:
 def parse(term: str, variables: Sequence[str]) -> list[Factor]:
     """The factors of a term; none for `1`.
 
+    Args:
+        term: the term as text.
+        variables: names of the columns.
+
     Raises:
-        TermError: not understood, or an unknown variable.
+        TermError: the term is not understood, or names an unknown variable.
     """
     if term == "1":
         return []
@@ -114,7 +128,7 @@ def parse(term: str, variables: Sequence[str]) -> list[Factor]:
         try:
             power = float(match["power"] or 1.0)
         except ValueError:
-            raise TermError(f"the term '{term}' has the power '{match['power']}', which is no number") from None
+            raise TermError(f"the term '{term}' has the power '{match['power']}', which is not a number") from None
         factors.append(Factor(_FUNCTIONS[call] if call else POWER, list(variables).index(name), power))
     return factors
 
@@ -125,7 +139,7 @@ def thesis_terms(variables: Sequence[str]) -> list[str]:
 
 
 def polynomials(variables: Sequence[str], degree: int) -> list[str]:
-    """Names of all products of the variables up to a degree."""
+    """Names of all products of variables up to a degree."""
     names, last = ["1"], [("", 0)]
     for _ in range(degree):
         last = [(f"{name}*{v}".lstrip("*"), j) for name, start in last for j, v in enumerate(variables) if j >= start]
@@ -149,10 +163,10 @@ def _apply(factor: Factor, x: Array) -> Array:
     return np.asarray(np.sign(x) * np.abs(x) ** factor.power)
 
 
-# inlined: to count the references of so many arrays at each call takes longer than the terms
+# inlined: in a call, counting the references to so many arrays takes longer than the terms
 @njit(cached=False, inline="always", error_model="numpy")
 def factor_at(kind: int, power: float, x: float) -> float:
-    """A factor."""
+    """Value of a factor at x."""
     if kind == SIN:
         return np.sin(x)
     if kind == COS:
@@ -172,7 +186,7 @@ def factor_at(kind: int, power: float, x: float) -> float:
 
 @njit(cached=False, inline="always", error_model="numpy")
 def slope_at(kind: int, power: float, x: float) -> float:
-    """The slope of a factor."""
+    """Derivative of a factor at x."""
     if kind == SIN:
         return np.cos(x)
     if kind == COS:
@@ -192,7 +206,15 @@ def slope_at(kind: int, power: float, x: float) -> float:
 
 @njit(cached=False, inline="always", error_model="numpy")
 def terms_at(x: Array, which: Indices, table: Table, value: Array, slope: Array) -> None:
-    """Fill value[j] and slope[j, :] of the terms `which` at variables x (V,); slope may have no rows: left out."""
+    """Evaluate terms and, if slope has rows, their derivatives.
+
+    Args:
+        x: (V,) the variables.
+        which: indices of the terms to evaluate.
+        table: the library.
+        value: (terms,) receives the values.
+        slope: (terms, V) receives the derivatives; without rows, they are left out.
+    """
     with_slope = slope.shape[0] > 0
     for j in which:
         product = 1.0

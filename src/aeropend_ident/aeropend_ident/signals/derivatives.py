@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Derivatives of noisy signals, in time and memory that grow with their length only.
+"""Derivatives of noisy signals, in time and memory proportional to their length.
 
-Both ways replace the signal f by a smooth g and differentiate that. `smoothed` penalises the square of g's third
-derivative; `tv_derivative` the total variation of g' (TVRegDiff: Chartrand, ISRN Applied Mathematics, 2011), so that
-g' may jump. Chartrand writes the latter with a dense integration matrix over the derivative; over its integral g, the
-same problem has five diagonals.
+Both methods replace the signal f by a smooth g and differentiate g. `smoothed` penalises the square of the third
+derivative of g. `tv_derivative` penalises the total variation of g' (TVRegDiff: Chartrand, ISRN Applied Mathematics,
+2011), so that g' can jump. Chartrand's equations for g' have a dense matrix; here the unknown is g, and the matrix has
+five diagonals.
+
+`scipy.interpolate.make_smoothing_spline` penalises the second derivative. To estimate a first derivative, the third one
+is penalised (Ramsay & Silverman, Functional Data Analysis, 2005, ch. 5).
 """
 
 from __future__ import annotations
@@ -19,13 +22,19 @@ Array = NDArray[np.float64]
 
 
 def noise_of(x: Array) -> Array:
-    """Standard deviation of white noise on signals (N,) or (N, S), from third differences, robust against steps."""
+    """Standard deviation of white noise on signals (N,) or (N, S), by third differences; steps hardly change it."""
     d = np.diff(x, 3, axis=0)
+    # 0.6745: median of |x| of the standard normal distribution; 20: sum of squares of 1, -3, 3, -1
     return np.asarray(np.median(np.abs(d - np.median(d, axis=0)), axis=0) / 0.6745 / np.sqrt(20.0))
 
 
 def differences(g: Array, period: float) -> Array:
-    """Derivative (N,) of samples (N,) by differences of fourth order, of second order at the ends."""
+    """Derivative (N,) of samples (N,) by central differences of fourth order, of second order at the ends.
+
+    Args:
+        g: (N,) samples.
+        period: [s] sample period.
+    """
     out = np.gradient(g, period, edge_order=2)
     out[2:-2] = (g[:-4] - 8.0 * g[1:-3] + 8.0 * g[3:-1] - g[4:]) / (12.0 * period)
     return np.asarray(out)
@@ -35,8 +44,10 @@ def smoothed(f: Array, period: float, strength: float | None = None) -> tuple[Ar
     """Smooth a signal (N,) and differentiate it.
 
     Args:
-        f: samples `period` s apart. strength: weight of the squared third difference; None: by generalised
-            cross-validation (Garcia, Computational Statistics & Data Analysis 54, 2010).
+        f: (N,) samples.
+        period: [s] sample period.
+        strength: weight of the squared third difference; None: by generalised cross-validation (Garcia, Computational
+            Statistics & Data Analysis 54, 2010).
 
     Returns:
         The smooth signal and its derivative, each (N,).
@@ -47,7 +58,7 @@ def smoothed(f: Array, period: float, strength: float | None = None) -> tuple[Ar
 
 
 def smoothness(f: Array) -> float:
-    """Samples over which `smoothed` averages a signal (N,)."""
+    """Number of samples over which `smoothed` averages a signal (N,)."""
     return float(2.0 * _cross_validated(f) ** (1.0 / 6.0))
 
 
@@ -70,7 +81,13 @@ def _cross_validated(f: Array) -> float:
 
 
 def _penalty(weights: Array, order: int, strength: float) -> Array:
-    """Lower bands (order + 1, N) of I + strength D'WD for the difference operator D of an order."""
+    """Lower bands (order + 1, N) of I + strength D'WD.
+
+    Args:
+        weights: (N - order,) diagonal of W.
+        order: of the difference operator D.
+        strength: weight of the penalty.
+    """
     n = len(weights) + order
     row = np.array([1.0])
     for _ in range(order):
@@ -87,9 +104,11 @@ def tv_derivative(f: Array, period: float, alpha: float | None = None, iteration
     """Differentiate a signal (N,) with total-variation regularisation.
 
     Args:
-        f: samples `period` s apart. alpha: weight of the total variation of the derivative, in units in which a
-            sample is 1 s; None: as much as leaves a residual of the size of the noise that the signal shows
-            (discrepancy principle). iterations: of lagged diffusivity.
+        f: (N,) samples.
+        period: [s] sample period.
+        alpha: weight of the total variation of the derivative, for a sample period of 1 s; None: the weight at which
+            the residual is as large as the noise of the signal (discrepancy principle).
+        iterations: greatest number of iterations (lagged diffusivity).
 
     Returns:
         The smooth signal and its derivative, each (N,).

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The thesis' study case (3.3): the Lorenz system by every method.
+"""The study case of the thesis (3.3): the Lorenz system, identified by each method.
 
 Run it with `python -m aeropend_ident.studies.lorenz [--noise 0.05]`.
 """
@@ -25,16 +25,26 @@ EQUATIONS: dict[str, dict[str, float]] = {"x": {"x": -10.0, "y": 10.0}, "y": {"x
                                           "z": {"z": -8.0 / 3.0, "x*y": 1.0}}
 MISMATCH: dict[str, dict[str, float]] = {"x": {"x": -9.5, "y": 9.5}, "y": {"x": 27.0, "y": -1.0, "x*z": -1.0},
                                          "z": {"z": -8.0 / 3.0, "x*y": 1.0}}
-"""A model that is wrong in ẋ and ẏ, as in the thesis' Fig 3.5; it prints no numbers."""
+"""A model that is wrong in ẋ and ẏ, as in Fig 3.5 of the thesis, which prints no coefficients."""
 
 PERIOD = 0.002
+"""[s] Sample period."""
+
 DURATION = 10.0
+"""[s] Length of a run."""
+
 DEGREE = 3
-"""Degree of the polynomials that terms are chosen from."""
+"""Degree of the polynomials among which terms are chosen."""
 
 
 def simulate(duration: float = DURATION, period: float = PERIOD, seed: int = 0) -> Array:
-    """States (N, 3) of a run that starts near (-8, 8, 27)."""
+    """States (N, 3) of a run that starts near (-8, 8, 27).
+
+    Args:
+        duration: [s] length.
+        period: [s] sample period.
+        seed: of the start.
+    """
     n, start = round(duration / period), np.array([-8.0, 8.0, 27.0]) + np.random.default_rng(seed).normal(size=3)
     library = Library.of(STATES, sorted({t for e in EQUATIONS.values() for t in e}))
     matrix = np.array([[EQUATIONS[s].get(t, 0.0) for t in library.names] for s in STATES])
@@ -54,7 +64,13 @@ def rates(states: Array) -> dict[str, Array]:
 
 
 def data(noise: float = 0.05, seed: int = 0, *, exact: bool = False) -> Dataset:
-    """A noisy run: noise as a share of each state's standard deviation; with exact derivatives if asked for."""
+    """A run with noise.
+
+    Args:
+        noise: standard deviation of the noise over that of each state.
+        seed: of the start and the noise.
+        exact: give the exact derivatives as well.
+    """
     x = simulate(seed=seed)
     y = x + noise * x.std(axis=0) * np.random.default_rng(seed + 1000).standard_normal(x.shape)
     columns = dict(zip(STATES, y.T))
@@ -62,31 +78,38 @@ def data(noise: float = 0.05, seed: int = 0, *, exact: bool = False) -> Dataset:
 
 
 def study(method: str, noise: float = 0.05, seed: int = 0) -> Identified:
-    """Identify one run by one method."""
+    """Identify the equations of a run.
+
+    Args:
+        method: one of `METHODS`.
+        noise: standard deviation of the noise over that of each state.
+        seed: of the start and the noise.
+    """
     return identify(data(noise, seed, exact=noise == 0.0 and method.endswith("sindy")), method,
                     polynomials(STATES, DEGREE), MISMATCH)
 
 
 def truth(method: str) -> dict[str, dict[str, float]]:
-    """What a method should find."""
+    """The equations that a method should find."""
     known: Mapping[str, Mapping[str, float]] = MISMATCH if method.startswith("discrepancy") else {}
     found = {s: {t: c - known.get(s, {}).get(t, 0.0) for t, c in e.items()} for s, e in EQUATIONS.items()}
     return {s: {t: c for t, c in e.items() if c != 0.0} for s, e in found.items()}
 
 
 def is_exact(found: Mapping[str, Mapping[str, float]], true: Mapping[str, Mapping[str, float]]) -> bool:
-    """Whether the terms of all equations are the true ones."""
+    """Whether all equations have exactly the true terms."""
     return all(set(found[s]) == set(true[s]) for s in true)
 
 
 @interruptible
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print what every method finds; the exit code."""
-    parser = Parser(prog="lorenz", description="The Lorenz system by every method.",
+    """Print the equations found by each method; returns the exit code."""
+    parser = Parser(prog="lorenz", description="Identify the Lorenz system by each method.",
                     epilog=f"examples:\n  python -m aeropend_ident.studies.lorenz --noise 0.1 --seed 3\n\n{EXIT_CODES}",
                     formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--noise", type=float, default=0.05, help="share of each state's spread (default: 0.05)")
-    parser.add_argument("--seed", type=int, default=0, help="of the noise and where it starts (default: 0)")
+    parser.add_argument("--noise", type=float, default=0.05,
+                        help="noise over the standard deviation of each state (default: 0.05)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the noise and of the start (default: 0)")
     options = parser.parse_args(arguments)
     if not (math.isfinite(options.noise) and 0.0 <= options.noise < 1.0):
         parser.error(f"--noise is {options.noise:g}: give a share from 0 to below 1")

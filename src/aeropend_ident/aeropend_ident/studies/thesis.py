@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of the thesis' chapters 4 and 5, printed and worked out anew: `python -m aeropend_ident.studies.thesis`.
+"""The tables of chapters 4 and 5 of the thesis, as printed and recomputed: `python -m aeropend_ident.studies.thesis`.
 
-"Feedback control of an aeropendulum based on a data-driven dynamic model", UFCG. Chapter 4 is worked out from its
-printed tables by the bench tests of this package. Chapter 5 is run on its simulation model, the preset `thesis`, twice:
-as the thesis did it (its library, derivatives, weights and threshold, with pysindy's optimiser) and by `identify`.
+"Feedback control of an aeropendulum based on a data-driven dynamic model", UFCG. Chapter 4 is recomputed from its
+printed tables by the bench tests of this package. Chapter 5 is recomputed on its simulation model, the preset `thesis`,
+in two ways: as in the thesis (its library, derivatives, weights and threshold, with the optimiser of pysindy), and by
+`identify`.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
 
 SECONDS = 70.0
+"""[s] Length of the recordings of chapter 5."""
+
 LIBRARY = Library.of((*STATES, "v_a"), thesis_terms((*STATES, "v_a")))
 
 
@@ -43,15 +46,15 @@ def _rows(name: str, names: Sequence[str], text: str) -> Rows:
 TABLE_4_1 = _rows("Table 4.1", ("v_a", "i_a"), """0.48/0.44 0.60/0.55 0.29/0.25 1.42/1.30 1.47/1.33 0.35/0.30 0.89/0.85
     0.74/0.69 1.31/1.17 1.54/1.40 0.78/0.74 1.58/1.57 0.79/0.73 0.99/0.96 1.76/1.67 0.57/0.52 0.37/0.35 1.93/1.89
     1.37/1.32 2.44/2.28 1.09/0.99""")
-"""Blocked rotor: V, A."""
+"""[V, A] Blocked rotor."""
 
 _SPEEDS = _rows("Table 4.2", ("v_a", "i_a", "omega"), """1.08/0.29/1158 1.182/0.33/1235 1.272/0.35/1306 1.377/0.40/1402
     1.483/0.45/1485 1.561/0.50/1561 1.666/0.55/1638 1.781/0.61/1734 1.864/0.65/1805 1.974/0.70/1885""")
 TABLE_4_2 = Rows(_SPEEDS.name, {**_SPEEDS.columns, "omega": RPM * _SPEEDS.columns["omega"]})
-"""Steady states: V, A, rad/s (printed in RPM)."""
+"""[V, A, rad/s] Steady states; the speed is printed in RPM."""
 
 CURVE_4_4 = (0.054, 0.0435, 0.0029)
-"""Thrust in N over the voltage, a v² + b v + c. Its points are not printed."""
+"""[N/V², N/V, N] Thrust over the voltage, a v² + b v + c. The points are not printed."""
 
 WRONG = {"mgd_over_J": 131.5, "lift": 1.65}
 """The mismatched model of section 5.4: θ̈ = -131.5 sin θ - 13.82 θ̇ + 1.65 ω²."""
@@ -60,7 +63,7 @@ THRESHOLD, WINDOW, WEAK = 0.9, 40, (120, 2, 30, 1e-6, 1.4e-3)
 """Section 5.2 and 5.3: λ; samples of the moving average; K, p, half-width, and γ without and with noise."""
 
 PRINTED_MSE = {"5.3": "1e-24", "5.4": "6e-10", "5.7": "3.7", "5.9": "0.18", "5.13": "2.55e-29", "5.14": "1.7e-12"}
-"""Of the arm's acceleration on the test set, by figure."""
+"""Figure -> printed mean squared error of the arm's acceleration on the test set."""
 
 FIGURES: dict[str, tuple[str, dict[str, dict[str, float]], int]] = {
     "5.3": ("noise-free, derivatives given: SINDy", {
@@ -85,16 +88,15 @@ FIGURES: dict[str, tuple[str, dict[str, dict[str, float]], int]] = {
         "theta": {"theta_dot": 1.002}, "theta_dot": {"theta_dot": -29.632, "omega*omega": 0.0, "sin(theta)": -117.36},
         "i_a": {"i_a": -8.8027, "omega": 0.0, "v_a": 0.0}, "omega": {"i_a": 18367.0, "omega": 41.114}}, 65),
 }
-"""By figure: what it shows, the printed coefficients of the true terms, and how many other terms it prints."""
-
+"""Figure -> its subject, the printed coefficients of the true terms, and the number of other terms that it prints."""
 
 DISCREPANCY = ("5.13", "5.14")
-"""Figures of section 5.4. They print model less truth; what must be added to the model is the negative of that."""
+"""Figures of section 5.4. They print the model minus the truth; the terms to be added are the negative of that."""
 
 
 @cache
 def states(seed: int) -> tuple[Array, Array]:
-    """States (N, 4) of `thesis` over 70 s, integrated in 32 steps a sample, and the voltage (N,)."""
+    """States (N, 4) of `thesis` over 70 s, integrated in 32 steps per sample, and the voltage (N,)."""
     model = load("thesis")
     v = actuator.voltage(model.numbers(), Excitation(duration=SECONDS, seed=seed).series())
     out = np.empty((7, len(v)))
@@ -109,7 +111,12 @@ def rates(seed: int) -> Array:
 
 
 def noisy(seed: int, decibel: float) -> tuple[Array, Array]:
-    """States with white noise, and its standard deviations (4,)."""
+    """States (N, 4) with white noise, and its standard deviations (4,).
+
+    Args:
+        seed: of the excitation and the noise.
+        decibel: [dB] signal-to-noise ratio.
+    """
     x, _ = states(seed)
     sigma = np.sqrt(np.mean(x**2, axis=0)) * 10.0 ** (-decibel / 20.0)
     return x + sigma * np.random.default_rng(1000 + seed).standard_normal(x.shape), sigma
@@ -134,14 +141,14 @@ def mismatched() -> Model:
 
 
 def missing() -> dict[str, dict[str, float]]:
-    """What that model lacks."""
+    """The terms that the mismatched model lacks."""
     wrong = in_library(mismatched())
     found = {s: {t: c - wrong[s].get(t, 0.0) for t, c in e.items()} for s, e in in_library(load("thesis")).items()}
     return {s: {t: c for t, c in e.items() if abs(c) > 1e-9} for s, e in found.items()}
 
 
 def chapter_4() -> Iterator[tuple[str, str, str, str]]:
-    """What is printed, what comes out here, and what is to be said: rows of text."""
+    """Rows of text: the quantity, the printed value, the recomputed value, and a remark."""
     resistance = estimates.blocked_rotor(TABLE_4_1).numbers["R_a"]
     yield "R_a, Table 4.1", "1.08 Ω, sd 0.04", _one(resistance), ""
     found = estimates.steady(TABLE_4_2, Estimate(1.08, resistance.sigma, "Ω", "Table 4.1"))
@@ -179,12 +186,14 @@ def _one(e: Estimate) -> str:
 
 
 def as_printed(figure: str, optimiser: ModuleType, seed: int = 0) -> Array:
-    """Coefficients (4, 31) by the thesis' own way, with pysindy's sequentially thresholded least squares.
+    """Coefficients (4, 31) by the method of the thesis: sequentially thresholded least squares of pysindy.
 
-    Its windows are built as far as their description goes; of the discrepancies' threshold nothing is printed.
+    The windows follow the description in the thesis. It does not print the threshold of the discrepancy methods.
 
     Args:
-        figure: of `FIGURES`. optimiser: pysindy. seed: of the excitation and the noise.
+        figure: of `FIGURES`.
+        optimiser: the module pysindy.
+        seed: of the excitation and the noise.
     """
     x, v = states(seed)
     exact = in_library(load("thesis"))
@@ -208,13 +217,22 @@ def as_printed(figure: str, optimiser: ModuleType, seed: int = 0) -> Array:
         rows, left = _weak_rows(terms[part], x[part], terms[part] @ known.T, count, power, half)
     stlsq = optimiser.STLSQ(threshold=1e-2 if figure in DISCREPANCY else THRESHOLD, alpha=penalty)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # that nothing is left of an equation, as it should be here
+        warnings.simplefilter("ignore", UserWarning)  # an equation has no terms, which is right here
         stlsq.fit(rows, left)
     return np.asarray(stlsq.coef_, dtype=float)
 
 
 def _weak_rows(terms: Array, x: Array, known: Array, count: int, power: int, half: int) -> tuple[Array, Array]:
-    """The weak form with `count` windows of (1 - s²)^power, spread evenly, by the trapezoidal rule."""
+    """The weak form with evenly spread windows (1 - s²)^power, by the trapezoidal rule.
+
+    Args:
+        terms: (N, P) the terms.
+        x: (N, S) the states.
+        known: (N, S) the known part of the derivatives.
+        count: number of windows.
+        power: of the windows.
+        half: half-width in samples.
+    """
     s = np.arange(-half, half + 1) / half
     phi, slope = (1.0 - s * s) ** power, -2.0 * power * s * (1.0 - s * s) ** (power - 1) / (half * SAMPLE_PERIOD)
     first = np.linspace(0, len(x) - len(s), count).astype(int)
@@ -225,7 +243,12 @@ def _weak_rows(terms: Array, x: Array, known: Array, count: int, power: int, hal
 
 
 def here(figure: str, seed: int = 0) -> Identified:
-    """The same by `identify`; Fig 5.17 on the simulated rig of the preset `bench`, not on the thesis' rig."""
+    """The figure's equations by `identify`; Fig 5.17 is of the simulated rig `bench`, not of the rig of the thesis.
+
+    Args:
+        figure: of `FIGURES`.
+        seed: of the excitation and the noise.
+    """
     x, v = states(seed)
     if figure == "5.17":
         model = load("bench")
@@ -240,11 +263,18 @@ def here(figure: str, seed: int = 0) -> Identified:
 
 
 def chapter_5(figure: str, seed: int = 0) -> Iterator[str]:
-    """A figure's matrix as text: true terms, then how many others, printed, as the thesis did it, and here."""
+    """A figure's matrix as text: the coefficients of the true terms, and the number of others.
+
+    There is a column for the printed values, one for the method of the thesis, and one for `identify`.
+
+    Args:
+        figure: of `FIGURES`.
+        seed: of the excitation and the noise.
+    """
     what, printed, others = FIGURES[figure]
     if figure in DISCREPANCY:
         printed = {s: {t: -c for t, c in e.items()} for s, e in printed.items()}
-        what += "; printed as model less truth, here with its sign turned"
+        what += "; printed as the model minus the truth, here with the opposite sign"
     peer: Array | None = None
     if figure != "5.17":
         try:
@@ -275,7 +305,7 @@ def chapter_5(figure: str, seed: int = 0) -> Iterator[str]:
 
 
 def _mse(matrix: Array, figure: str, seed: int) -> float:
-    """Mean squared error of the arm's acceleration on the last quarter, from noise-free states."""
+    """Mean squared error of the arm's acceleration in the last quarter of the noise-free states."""
     x, v = states(seed)
     whole = matrix + (matrix_of(in_library(mismatched())) if figure in DISCREPANCY else 0.0)
     late = slice(round(0.75 * len(x)), None)
@@ -285,17 +315,17 @@ def _mse(matrix: Array, figure: str, seed: int) -> float:
 
 @interruptible
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the tables; the exit code."""
+    """Print the tables; returns the exit code."""
     parser = Parser(prog="thesis", formatter_class=argparse.RawDescriptionHelpFormatter, epilog="""examples:
   python -m aeropend_ident.studies.thesis                 all tables, a few minutes
   python -m aeropend_ident.studies.thesis 4               chapter 4 only
   python -m aeropend_ident.studies.thesis 5.9 5.14        two figures of chapter 5
 
 exit codes: 0, 2 no such table, 130 interrupted""",
-                    description="The tables of the thesis' chapters 4 and 5, printed and worked out anew.")
+                    description="The tables of chapters 4 and 5 of the thesis, as printed and recomputed.")
     parser.add_argument("which", nargs="*", metavar="TABLE",
                         help=f"4, or a figure: {', '.join(FIGURES)} (default: all)")
-    parser.add_argument("--seed", type=int, default=0, help="of the excitation and the noise (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the excitation and of the noise (default: 0)")
     options = parser.parse_args(arguments)
     wanted = options.which or ["4", *FIGURES]
     unknown = [name for name in wanted if name != "4" and name not in FIGURES]
