@@ -10,8 +10,8 @@ With residuals r_c (in units of a reading's noise) of channels c, and parameters
 - The prior (z standard normal) keeps parameters from moving far to stand in for a missing effect.
 
 Both weights are renewed as the fit goes on. Fits are compared by their log evidence in Laplace's approximation: log
-likelihood, log prior, and log Occam factor (D. MacKay, Information Theory, Inference, and Learning Algorithms, 2003,
-chapter 28).
+likelihood plus log Occam factor, the prior density times the posterior volume (D. MacKay, Information Theory,
+Inference, and Learning Algorithms, 2003, chapter 28).
 
 The steps are Levenberg-Marquardt's. `scipy.optimize.least_squares` with the same residuals, Jacobian and weights ends
 at the same cost and takes 2.5 to 3 times the CPU time (`make bench ARGS="--only optimiser"`): it starts anew whenever
