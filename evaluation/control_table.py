@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Each control law against every effect of the catalogue at its default size: what it does to the steps, and what is
-left of that when the law's model names the effect.
+"""Each control law against every effect of the catalogue at its default size.
+
+The table shows how an effect changes the steps, and how much of that is left when the law's model names the effect.
 
 `python -m evaluation.control_table [LAW ...] [--effects EFFECT ...] [--diagnosed]` prints the tables. With
 `--diagnosed` the model is not the true one but what `diagnose` makes of a recording of that rig.

@@ -90,7 +90,9 @@ def show(file: Path, target: str, document: Document | None, table: Callable[[Do
     """Write the table of the last full run of a `make` target into a file that has its marks.
 
     Args:
-        file: a README. target: "bench" or "soak". document: its results, if there are any.
+        file: a README.
+        target: "bench" or "soak".
+        document: its results, if there are any.
         table: makes Markdown of them.
 
     Raises:

@@ -64,7 +64,9 @@ def diagnosed(*args: str | Path, code: int = 0, limit: float = LIMIT_S) -> Run:
     """Run `diagnose` as it is installed.
 
     Args:
-        args: of its command line. code: the exit code expected. limit: s it may take.
+        args: of its command line.
+        code: the exit code expected.
+        limit: s it may take.
 
     Raises:
         NotMeasuredError: it is not installed, or ended otherwise.

@@ -60,7 +60,11 @@ def curve(name: str, unit: str, points: Sequence[float], run: Callable[[float], 
     """Measure the points of a curve, and the exponent at its end; a point not done in time ends it.
 
     Args:
-        name: of what grows. unit: of the points. run: measures one. start: s CPU that do not count.
+        name: of what grows.
+        unit: of the points.
+        points: at which it is measured.
+        run: measures one.
+        start: s CPU that do not count.
     """
     about = measure.load()
     runs: dict[float, Run] = {}

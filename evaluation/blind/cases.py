@@ -194,7 +194,7 @@ def _others(id_: str, rng: np.random.Generator) -> dict[str, float]:
     }.get(id_, dict)()
 
 
-def _sized(id_: str, sizer: Sizer, goal: float, form: str, nominal: Mapping[str, float], sensing: Mapping[str, float],
+def _sized(id_: str, sizer: Sizer, goal: float, form: str, nominal: Mapping[str, float],
            rng: np.random.Generator) -> tuple[dict[str, object], float]:
     """An effect with its parameters, drawn, sized to leave `goal` floors; and its size in floors."""
     other = form == "other"
@@ -252,7 +252,7 @@ def draw(name: str, kind: str, effects: list[str], form: str, nominal: Mapping[s
     for id_ in effects:
         assert sizer is not None
         goal = math.exp(rng.uniform(*np.log(FLOORS)))
-        entry, size = _sized(id_, sizer, goal, form, nominal, sensing, rng)
+        entry, size = _sized(id_, sizer, goal, form, nominal, rng)
         drawn.append(entry)
         sizes.append(size)
     inside = {str(e["effect"]): e["parameters"] for e in drawn if e["effect"] in EFFECTS}

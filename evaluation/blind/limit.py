@@ -118,7 +118,8 @@ def descend(residual: Callable[[Array], Array], coordinates: Sequence[Coordinate
 
     Args:
         residual: x (P,) -> (N,).
-        coordinates: P of them. start: (P,).
+        coordinates: P of them.
+        start: (P,).
         steps: at most.
         frozen: (N, Q) derivative by the first Q coordinates, taken as constant; the others' are renewed each step.
         tolerance: share of the cost that a step must gain to be followed by another.
@@ -177,7 +178,9 @@ class Readings:
         """Take the truth's revolutions, over which the speed is compared.
 
         Args:
-            truth: the rig. duty: (N,) from rest. sigma: channel -> of one reading; `omega`: besides its timing.
+            truth: the rig.
+            duty: (N,) from rest.
+            sigma: channel -> of one reading; `omega`: besides its timing.
         """
         self.truth, self.duty, self.sigma = truth, duty, sigma
         run = dynamics.simulate(truth, duty)
@@ -237,8 +240,9 @@ def limit(numbers_true: Mapping[str, float], effects_true: Mapping[str, Mapping[
     """The accuracy of a likelihood test that knows both hypotheses exactly, against its hardest rival.
 
     Args:
-        numbers_true: the rig's numbers. effects_true: its one effect, with all parameters (of a form that the table
-            lists); for `parameter_mismatch` the number and its value, which is in `numbers_true` too.
+        numbers_true: the rig's numbers.
+        effects_true: its one effect, with all parameters (of a form that the table lists); for `parameter_mismatch` the
+            number and its value, which is in `numbers_true` too.
         duty: (N,) 0..1, from rest.
         sigma: channel -> standard deviation of a reading, as in `Signals.sigma`.
         nominal: the model whose numbers are off by up to `OFF`; `bench` by default.

@@ -283,8 +283,9 @@ def sparse_regression(signals: Signals, model: Model | None = None, optimizer: s
     the held-out rows best with the least strain on the numbers, within one standard error of the difference.
 
     Args:
-        signals: a recording. model: nominal; `bench` by default. optimizer: "frols" (forward selection, the best
-            of the three here), "stlsq" or "sr3".
+        signals: a recording.
+        model: nominal; `bench` by default.
+        optimizer: "frols" (forward selection, the best of the three here), "stlsq" or "sr3".
     """
     started = time.perf_counter()
     with threadpool_limits(1):
@@ -404,7 +405,8 @@ def stepwise_bic(signals: Signals, model: Model | None = None, budget: float = 1
     are fitted in full, and the one with the lowest BIC is kept if that is below the BIC without it.
 
     Args:
-        signals: a recording from rest. model: nominal; `bench` by default.
+        signals: a recording from rest.
+        model: nominal; `bench` by default.
         budget: s after which no further fit begins; `in_time` tells whether it was enough.
     """
     started = time.perf_counter()

@@ -248,7 +248,9 @@ def states(p: Array, duty: Array, gusts: Array, controller: Callable[[float, flo
     """Integrate from rest.
 
     Args:
-        p: parameters. duty: (N,) held from each sample to the next. gusts: (N + 2,) or (0,).
+        p: parameters.
+        duty: (N,) held from each sample to the next.
+        gusts: (N + 2,) or (0,).
         controller: (t, angle shown) -> duty, in place of `duty`.
 
     Returns:

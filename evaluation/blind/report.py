@@ -51,7 +51,8 @@ def report(labels: Sequence[Mapping[str, Any]], verdicts: Mapping[str, Mapping[s
     """Score everything, print the tables, and write results.json, confusion.png, size.png, calibration.png.
 
     Args:
-        labels: the opened labels. verdicts: recording -> diagnosis.json.
+        labels: the opened labels.
+        verdicts: recording -> diagnosis.json.
         peers: peer -> recording -> {"effects": [keys], "place": .., "seconds": ..}; a peer is scored on the recordings
             that it was given, beside the diagnosis on the same ones.
         out: folder, made if it is not there.

@@ -398,7 +398,9 @@ def missing(heard: Stamps, publisher: Stamps, there: Stamps) -> int:
     what came after its last: a publisher that ends does not wait until everybody has what it said.
 
     Args:
-        heard: (N,) stamps. publisher: (N,) a number of who sent them. there: (M,) stamps of the bag.
+        heard: (N,) stamps.
+        publisher: (N,) a number of who sent them.
+        there: (M,) stamps of the bag.
     """
     last = np.flatnonzero(heard == there[-1]) if len(there) else ()
     end = int(last[-1]) + 1 if len(last) else len(heard)

@@ -62,8 +62,11 @@ def margins(model: Model, law: str, gains: Mapping[str, float] | None = None, at
     """Margins of a law around an operating point.
 
     Args:
-        model: what the law knows. law: its name in `LAWS`. gains: by name; the tuned ones by default.
-        at: rad, or rad/s for the cascade. on: the model of the rig, if that is another.
+        model: what the law knows.
+        law: its name in `LAWS`.
+        gains: by name; the tuned ones by default.
+        at: rad, or rad/s for the cascade.
+        on: the model of the rig, if that is another.
 
     Raises:
         MarginError: the loop does not come to rest there.

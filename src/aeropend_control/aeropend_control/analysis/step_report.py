@@ -68,7 +68,9 @@ def on_grid(time: ArrayLike, columns: Mapping[str, ArrayLike], period: float = S
     """Put samples on a uniform grid, those that are missing by straight lines.
 
     Args:
-        time: (N,) s, rising. columns: (N,) each; NaN where there is no reading. period: s.
+        time: (N,) s, rising.
+        columns: (N,) each; NaN where there is no reading.
+        period: s.
 
     Returns:
         Time (M,), the columns (M,), and how many of M samples were missing.
@@ -104,7 +106,8 @@ def table(laws: Mapping[str, Sequence[StepResponse]], unit: Mapping[str, str] | 
     """One row a step, and the limits of each law below its steps; what is missed is marked with ✗.
 
     Args:
-        laws: responses by the name of the law. unit: of each law's reference; rad where it is not given.
+        laws: responses by the name of the law.
+        unit: of each law's reference; rad where it is not given.
     """
     shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     shown.add_column("law", overflow="fold")
@@ -139,7 +142,12 @@ def draw(time: Array, reference: Array, y: Array, duty: Array, title: str, unit:
     """The response with its reference, and the duty below, as an SVG image.
 
     Args:
-        time: (N,) s. reference: (N,) and y: (N,), in `unit`. duty: (N,) 0..1. title: on top.
+        time: [s] (N,) instants.
+        reference: (N,) reference, in `unit`.
+        y: (N,) response, in `unit`.
+        duty: (N,) 0 to 1.
+        title: on top of the image.
+        unit: of reference and response.
     """
     left, width, panels = 70.0, 800.0, ((40.0, 300.0), (390.0, 120.0))
     thin = slice(None, None, max(1, len(time) // 1000))

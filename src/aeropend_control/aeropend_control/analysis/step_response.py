@@ -57,7 +57,9 @@ def step_responses(time: ArrayLike, y: ArrayLike, reference: ArrayLike, smoothin
     have been where the response starts.
 
     Args:
-        time: (N,) s, uniform and rising. y: (N,) response. reference: (N,), in the unit of y.
+        time: (N,) s, uniform and rising.
+        y: (N,) response.
+        reference: (N,), in the unit of y.
         smoothing: s, width of the parabolas; 0: none.
 
     Returns:

@@ -103,7 +103,10 @@ def place(model: Model, t_s: float, M_p: float, at: float = OPERATING_POINT, oth
     set-point weight.
 
     Args:
-        model: the model file's. t_s: settling time to 2 %, s. M_p: overshoot, 0 < M_p < 1. at: angle, rad.
+        model: the model file's.
+        t_s: settling time to 2 %, s.
+        M_p: overshoot, 0 < M_p < 1.
+        at: angle, rad.
         other_poles: how many times faster than the pair the others decay.
 
     Raises:

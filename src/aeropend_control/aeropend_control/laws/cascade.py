@@ -143,7 +143,8 @@ class Cascade:
         """Take a sample and return the duty (0..1) to apply from the next sample on.
 
         Args:
-            sample: NaN where a reading was lost. reference: rad/s, finite.
+            sample: NaN where a reading was lost.
+            reference: rad/s, finite.
         """
         s = self._observer.step(sample.theta, self._duty, sample.omega, sample.i_a).state
         if self._bumpless:

@@ -73,7 +73,10 @@ def tune(model: Model, t_s: float = 1.5, M_p: float = 0.1, at: float = OPERATING
     """Gains by pole placement for the model, linear around an angle (see `tuning.place`).
 
     Args:
-        model: the model file's. t_s: settling time to 2 %, s. M_p: overshoot, 0 < M_p < 1. at: angle, rad.
+        model: the model file's.
+        t_s: settling time to 2 %, s.
+        M_p: overshoot, 0 < M_p < 1.
+        at: angle, rad.
 
     Raises:
         TuningError: one line that says which requirement cannot be met.

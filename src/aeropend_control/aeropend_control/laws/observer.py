@@ -124,8 +124,10 @@ class Observer:
         """Take a reading, with the duty that is applied from it on.
 
         Args:
-            theta: rad as read; NaN where there is none. duty: 0..1.
-            omega: rad/s as read, and i_a, A; used only if the observer reads the motor.
+            theta: [rad] angle as read; NaN where it is missing.
+            duty: 0 to 1.
+            omega: [rad/s] speed as read; used only if the observer reads the motor.
+            i_a: [A] current as read; used only if the observer reads the motor.
 
         Returns:
             The estimate for the next sample, or for when a duty given then begins to act, if that is later.

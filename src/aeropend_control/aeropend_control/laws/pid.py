@@ -22,14 +22,17 @@ class PID:
         """Gains in units of output per unit of input, per second, times second.
 
         Args:
-            kp: proportional gain. ki: integral gain. kd: derivative gain.
+            kp: proportional gain.
+            ki: integral gain.
+            kd: derivative gain.
             period: s between samples.
             setpoint_weight: b, 0..1.
             derivative_tau: s of the first-order filter of the derivative; 0: none, else at least one period.
             tracking_time: s in which the integral is led back; 0: half of sqrt(kd/ki), or kp/ki without a derivative.
-            low: least output. high: greatest output.
-            exact: sample the derivative's filter and the tracking exactly for inputs held over a period, instead of
-                by forward Euler; the integral of a held error is the same by both. No time is too short for it.
+            low: least output.
+            high: greatest output.
+            exact: sample the derivative's filter and the tracking exactly for inputs held over a period, instead of by
+                forward Euler; the integral of a held error is the same by both. No time is too short for it.
 
         Raises:
             ValueError: one line that says which number cannot be used.

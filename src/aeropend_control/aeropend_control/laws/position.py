@@ -64,7 +64,8 @@ class PositionLaw:
         """Forget the past; `duty` has been applied since long, and the law goes on from there without a bump.
 
         Args:
-            sample: a recent one, from whose angle to start; without one, that of the next. duty: 0..1.
+            sample: a recent one, from whose angle to start; without one, that of the next.
+            duty: 0..1.
         """
         self._observer.reset(duty, math.nan if sample is None else sample.theta)
         self._pid.reset()
@@ -84,7 +85,8 @@ class PositionLaw:
         """Take a sample and return the duty (0..1) to apply from the next sample on.
 
         Args:
-            sample: NaN where a reading was lost. reference: rad, finite.
+            sample: NaN where a reading was lost.
+            reference: rad, finite.
         """
         estimate = self._observer.step(sample.theta, self._duty, sample.omega, sample.i_a)
         s = estimate.state

@@ -39,7 +39,9 @@ class Supervisor:
         Args:
             law: gets one sample after the other.
             angle_limit: rad; an arm further up than this, to either side, is let down.
-            low: least reference. high: greatest reference. unit: of both, for people.
+            low: least reference.
+            high: greatest reference.
+            unit: of both, for people.
             measures: the readings, by the names of `Sample`, that the law cannot do without.
             period: of the samples, s.
             timeout: s without a reading, or without effect on the rig, after which the law starts anew.
@@ -86,7 +88,8 @@ class Supervisor:
         """Take a sample and return the duty to send; None for a sample that was there before.
 
         Args:
-            stamp_ns: instant of sampling, ns. sample: NaN where there is no reading.
+            stamp_ns: instant of sampling, ns.
+            sample: NaN where there is no reading.
         """
         if not self._follows(stamp_ns):
             return None

@@ -47,7 +47,8 @@ def draw(effect: str | None, seed: int | None) -> tuple[str, Model]:
     """A rig: `bench` with numbers a little off and one effect of the catalogue, both by chance.
 
     Args:
-        effect: pins the effect's id, or `none`. seed: pins all chance.
+        effect: pins the effect's id, or `none`.
+        seed: pins all chance.
 
     Returns:
         The effect's id and the rig's model.

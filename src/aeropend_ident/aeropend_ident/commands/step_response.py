@@ -53,7 +53,8 @@ def columns(recording: Recording, law: str) -> tuple[step_report.Array, dict[str
     """Time (M,) and columns (M,) from the first reference on, on a grid.
 
     Args:
-        recording: with references. law: a key of `LAWS`; references out of its range, which it refuses, do not count.
+        recording: with references.
+        law: a key of `LAWS`; references out of its range, which it refuses, do not count.
 
     Raises:
         StepError: no reference, or no response to it.

@@ -335,7 +335,8 @@ def _even(t: Floats, index: Floats) -> _Grid:
     """The even clock that rows are taken by whose stamps are late, rounded or repeated.
 
     Args:
-        t: (N,) stamps, s. index: (N,) how far the clock has come at each row, rising by 1 a row in the mean.
+        t: (N,) stamps, s.
+        index: (N,) how far the clock has come at each row, rising by 1 a row in the mean.
     """
     n = len(t)
     steps = np.diff(t)

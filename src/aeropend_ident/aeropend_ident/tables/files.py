@@ -51,7 +51,8 @@ def read(path: Path, *, sheet: str | None = None, delimiter: str | None = None, 
     Args:
         path: CSV, TSV, text, .xlsx, .mat, .npy or .npz.
         sheet: of a workbook, where several hold numbers.
-        delimiter, decimal: of text, where the file leaves them open.
+        delimiter: of text, where the file leaves them open.
+        decimal: likewise.
 
     Raises:
         TableError: there is no table in it, or it cannot be read; one line that says why.

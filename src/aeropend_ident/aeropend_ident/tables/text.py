@@ -113,7 +113,9 @@ def read_text(path: Path, delimiter: str | None = None, decimal: str | None = No
     """Read a table from a text file.
 
     Args:
-        path: the file. delimiter, decimal: where the file leaves them open.
+        path: the file.
+        delimiter: where the file leaves them open.
+        decimal: likewise.
 
     Raises:
         TableError: it holds no table; one line that says what is wrong.
