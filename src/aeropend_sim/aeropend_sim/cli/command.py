@@ -14,6 +14,8 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, NoReturn, ParamSpec
 
+from aeropend_sim.model.parameters import PRESETS
+
 EXIT_CODES = "exit codes: 0 done, 2 the input cannot be used (one line says why), 130 interrupted"
 
 Completer = Callable[..., Iterable[str]]
@@ -123,8 +125,6 @@ def files(prefix: str, **_: Any) -> Iterable[str]:
 
 def _completer(action: argparse.Action) -> Completer:
     from argcomplete.completers import DirectoriesCompleter, FilesCompleter
-
-    from aeropend_sim.model.parameters import PRESETS
 
     by_metavar: dict[Any, Completer] = {
         "BAG": FilesCompleter((".mcap", ".db3")),  # and folders

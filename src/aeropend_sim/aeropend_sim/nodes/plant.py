@@ -75,7 +75,7 @@ def _setting(name: str) -> Setting:
     return Setting(p.low, p.description, p.unit, p.low, p.high)
 
 
-NUMBERS = [
+PARAMETER_NAMES = [
     *PARAMETERS,
     *(f"effects.{effect.id}.{key}" for effect in CATALOGUE.values() for key in effect.parameters),
     *(f"effects.{PARAMETER_MISMATCH}.{key}" for key in MODEL_NAMES),
@@ -93,7 +93,7 @@ USAGE = usage(
     ],
     "  model.*, sensing.*, effects.ID.*: the parameters of a model file; missing parameters of an effect take their"
     " defaults\n  effects: " + ", ".join([*CATALOGUE, PARAMETER_MISMATCH]),
-    further={name: _setting(name) for name in NUMBERS},
+    further={name: _setting(name) for name in PARAMETER_NAMES},
 )
 
 
