@@ -6,8 +6,8 @@ import pytest
 
 from aeropend_control.analysis import closed_loop
 from aeropend_control.analysis.step_response import step_responses
-from aeropend_control.analysis.tuning import TuningError
 from aeropend_control.laws.feedback_linearization import THESIS_GAINS, FeedbackLinearization, tune
+from aeropend_control.laws.tuning import TuningError
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import Model, load
 from aeropend_sim.model.rig import Rig, Sample

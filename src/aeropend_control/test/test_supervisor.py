@@ -51,7 +51,7 @@ class Loop:
 @pytest.fixture
 def loop():
     loop = Loop()
-    assert loop.supervisor.refer(0.4)
+    assert loop.supervisor.set_reference(0.4)
     return loop
 
 
@@ -60,7 +60,7 @@ def test_the_duty_is_0_until_there_is_a_reference():
     assert loop.samples(5) == [0.0] * 5
     assert "no reference" in loop.supervisor.fault
     assert loop.law.samples == []
-    loop.supervisor.refer(0.4)
+    loop.supervisor.set_reference(0.4)
     assert loop.samples(3) == [0.01, 0.02, 0.03]
     assert loop.supervisor.fault == ""
 
@@ -68,12 +68,12 @@ def test_the_duty_is_0_until_there_is_a_reference():
 @pytest.mark.parametrize("reference", [math.nan, math.inf, -math.inf, -0.01, 0.81])
 def test_a_reference_out_of_range_is_refused_and_the_one_before_stays(loop, reference):
     loop.sample()
-    assert not loop.supervisor.refer(reference)
+    assert not loop.supervisor.set_reference(reference)
     assert loop.supervisor.reference == 0.4
     assert "give 0 to 0.8 rad" in loop.supervisor.refusal
     assert loop.supervisor.counts["refused"] == 1
     assert loop.sample() == 0.02
-    assert loop.supervisor.refer(0.8)
+    assert loop.supervisor.set_reference(0.8)
     assert loop.supervisor.refusal == ""
 
 
@@ -120,14 +120,14 @@ def test_after_a_long_gap_the_law_starts_anew(loop):
 
 def test_it_goes_on_from_the_duty_that_the_rig_held_meanwhile(loop):
     loop.samples(20)
-    loop.supervisor.applied(0.2)
+    loop.supervisor.note_applied(0.2)
     loop.sample(after=100)
     assert loop.law.since == 0.2
 
 
 def test_silence_means_duty_0_and_a_new_start(loop):
     loop.samples(5)
-    loop.supervisor.silent()
+    loop.supervisor.on_timeout()
     assert loop.supervisor.duty == 0.0
     assert "no sample for 0.05 s" in loop.supervisor.fault
     assert loop.sample(after=40) == 0.01
@@ -148,7 +148,7 @@ def test_nan_means_duty_0_and_the_law_bridges_a_short_one(loop):
 def test_only_what_the_law_measures_must_be_there(loop):
     assert loop.sample(omega=math.nan) == 0.01
     speed = Loop(measures=("omega",))
-    speed.supervisor.refer(0.4)
+    speed.supervisor.set_reference(0.4)
     assert speed.sample(omega=math.nan) == 0.0
     assert "omega of a sample is NaN" in speed.supervisor.fault
     assert speed.sample(theta=math.nan) == 0.0
@@ -160,26 +160,26 @@ def test_beyond_the_limit_the_duty_stays_0_until_the_next_reference(loop, theta)
     assert loop.sample(theta=theta) == 0.0
     assert "beyond the limit of 1 rad" in loop.supervisor.fault
     assert loop.samples(100) == [0.0] * 100
-    assert not loop.supervisor.refer(math.nan)
+    assert not loop.supervisor.set_reference(math.nan)
     assert loop.sample() == 0.0
-    assert loop.supervisor.refer(0.4)
+    assert loop.supervisor.set_reference(0.4)
     assert loop.sample() == 0.01
     assert loop.supervisor.counts["angle limit"] == 1
 
 
 def test_while_the_rig_is_off_the_law_starts_anew_with_each_sample(loop):
     for _ in range(10):
-        loop.supervisor.applied(loop.supervisor.duty)
+        loop.supervisor.note_applied(loop.supervisor.duty)
         loop.sample()
     for _ in range(40):
-        loop.supervisor.applied(0.0)
+        loop.supervisor.note_applied(0.0)
         duty = loop.sample()
         assert duty <= 0.36  # 0.5 in the end, if it wound up
     assert duty == 0.01
     assert "applies duty 0" in loop.supervisor.fault
     loop.law.output = 0.2
     loop.sample()
-    loop.supervisor.applied(0.2)
+    loop.supervisor.note_applied(0.2)
     loop.law.output = None
     assert loop.samples(2) == [0.02, 0.03]
     assert loop.supervisor.fault == ""

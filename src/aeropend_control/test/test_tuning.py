@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 
-from aeropend_control.analysis.tuning import (
+from aeropend_control.laws.tuning import (
     TABLE_6_1,
     Requirements,
     TuningError,

@@ -3,33 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from aeropend_control.laws.law import Law
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 from aeropend_sim.model.rig import Rig, Sample, Truth
 
 Array = NDArray[np.float64]
-
-
-class Law(Protocol):
-    """A control law: samples in, duties out."""
-
-    def reset(self, sample: Sample | None = None, duty: float = 0.0) -> None:
-        """Forget the past; `duty` has been applied since long, by `sample` if that is known.
-
-        The law goes on from that duty without a bump.
-        """
-
-    def step(self, sample: Sample, reference: float) -> float:
-        """Take a sample and return the duty (0..1) to apply from the next sample on."""
-        ...
-
-    def retune(self, gains: Mapping[str, float]) -> None:
-        """Take other gains, all or some, without a bump; a bad one raises GainError and changes nothing."""
 
 
 class ClosedLoop(NamedTuple):

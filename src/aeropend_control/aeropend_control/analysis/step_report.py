@@ -16,8 +16,9 @@ from rich import box
 from rich.table import Table
 
 from aeropend_control.analysis.step_response import StepError, StepResponse
-from aeropend_control.analysis.tuning import TABLE_6_1
 from aeropend_control.laws.cascade import REQUIREMENTS
+from aeropend_control.laws.tuning import TABLE_6_1
+from aeropend_sim.cli.axis import multiples, tick_step
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 from aeropend_sim.untrusted import printable
 
@@ -189,8 +190,6 @@ def draw(time: Array, reference: Array, y: Array, duty: Array, title: str, unit:
 
 
 def _ticks(low: float, high: float) -> list[float]:
-    """Four to ten round numbers."""
-    raw = (high - low) / 8.0
-    size = 10.0 ** math.floor(math.log10(raw))
-    step = next(size * m for m in (1.0, 2.0, 5.0, 10.0) if size * m >= raw)
-    return [round(k * step, 12) for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
+    """Three to nine round numbers along an axis."""
+    step = tick_step(low, high, 8.0)
+    return [round(k * step, 12) for k in multiples(low, high, step)]

@@ -41,7 +41,7 @@ class Allocation:
     def duty(self, thrust: float, s: dynamics.State) -> tuple[float, float]:
         """Duty for a thrust (N) in a state, and the thrust that comes of it within the limits of the duty."""
         air_time = self.air_time(self.thrust_time)
-        speed = self.speed(self.led(thrust, s, air_time))
+        speed = self.speed(self.static_thrust_for(thrust, s, air_time))
         rotor_time = self.thrust_time - air_time
         n, resistance = self._numbers, self.resistance(s)
         if rotor_time:
@@ -53,17 +53,17 @@ class Allocation:
         current += self.holding_current(now, speed)
         wanted = n["K_e"] * now + self.drop(current, s)
         duty, given = self.duty_of_voltage(wanted)
-        return duty, self.unled(self.thrust(speed + (given - wanted) / slope), s, air_time)
+        return duty, self.thrust_from(self.thrust(speed + (given - wanted) / slope), s, air_time)
 
     def air_time(self, thrust_time: float) -> float:
         """In which part of the time for the thrust the air is made to follow; 0 where it does not lag."""
         return min(self._thrust_lag, 0.5 * thrust_time)
 
-    def led(self, thrust: float, s: dynamics.State, air_time: float) -> float:
+    def static_thrust_for(self, thrust: float, s: dynamics.State, air_time: float) -> float:
         """Static thrust that drives the air so that its thrust closes in on what is wanted in that time."""
         return s.thrust + self._thrust_lag / air_time * (thrust - s.thrust) if air_time else thrust
 
-    def unled(self, thrust: float, s: dynamics.State, air_time: float) -> float:
+    def thrust_from(self, thrust: float, s: dynamics.State, air_time: float) -> float:
         """The inverse of `led`."""
         return s.thrust + air_time / self._thrust_lag * (thrust - s.thrust) if air_time else thrust
 

@@ -14,7 +14,6 @@ import math
 from collections.abc import Mapping
 from typing import ClassVar
 
-from aeropend_control.analysis.tuning import OPERATING_POINT, TABLE_6_1, TIME_SHARE, Requirements, place, thrust_lag
 from aeropend_control.laws import feedback_linearization
 from aeropend_control.laws.allocation import Allocation
 from aeropend_control.laws.feedback_linearization import FeedbackLinearization
@@ -22,6 +21,7 @@ from aeropend_control.laws.gains import Gain, checked
 from aeropend_control.laws.observer import Estimate, Observer
 from aeropend_control.laws.pid import PID
 from aeropend_control.laws.reference_model import DAMPING, ReferenceModel
+from aeropend_control.laws.tuning import OPERATING_POINT, TABLE_6_1, TIME_SHARE, Requirements, place, thrust_lag
 from aeropend_sim.model import dynamics
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 from aeropend_sim.model.rig import Sample
@@ -225,8 +225,8 @@ class FeedbackLinearizationCascade(FeedbackLinearization):
         assert self._loop is not None
         a = self._allocation
         air_time = a.air_time(self.gains["thrust_time"])
-        duty, speed = self._loop.duty(a.speed(a.led(thrust, s, air_time)), s)
-        return duty, a.unled(a.thrust(speed), s, air_time)
+        duty, speed = self._loop.duty(a.speed(a.static_thrust_for(thrust, s, air_time)), s)
+        return duty, a.thrust_from(a.thrust(speed), s, air_time)
 
 
 def _defaults() -> dict[str, float]:

@@ -18,7 +18,10 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from aeropend_control.analysis.tuning import (
+from aeropend_control.laws.gains import Gain
+from aeropend_control.laws.observer import Estimate
+from aeropend_control.laws.position import NEVER, TRACKING_TIME, PositionLaw
+from aeropend_control.laws.tuning import (
     OPERATING_POINT,
     OVERSHOOT_SHARE,
     TABLE_6_1,
@@ -26,9 +29,6 @@ from aeropend_control.analysis.tuning import (
     place,
     settling_time,
 )
-from aeropend_control.laws.gains import Gain
-from aeropend_control.laws.observer import Estimate
-from aeropend_control.laws.position import NEVER, TRACKING_TIME, PositionLaw
 from aeropend_sim.model.parameters import Model
 
 GAINS = {

@@ -30,6 +30,12 @@ CURRENT_TIME = 0.05
 OUTLIER = (0.2, 5.0)
 """A speed further off than this share and this much (rad/s) is believed only with the third such reading."""
 
+OUTLIERS_BELIEVED = 3
+"""Number of outliers in a row from which on they are used, limited to the bound of `OUTLIER` (choice)."""
+
+LARGEST_BIAS = 1.0
+"""[V] Bound of the bias of the motor's voltage (choice)."""
+
 LEAST_NOISE = 1e-4
 """rad: readings are never trusted more than this, since no model is exact."""
 
@@ -52,18 +58,24 @@ class Estimate(NamedTuple):
     ground: float
 
 
-class _Motor(NamedTuple):
-    """Names of what the observer keeps of the motor, in an array."""
+class MotorCorrection(NamedTuple):
+    """State of the correction by the readings of the motor.
 
-    voltage: int = 0
-    current: int = 1
-    read: int = 2
-    at_pulse: int = 3
-    outliers: int = 4
-    samples: int = 5
+    Attributes:
+        voltage: [V] bias of the motor's voltage.
+        current: [A] bias of the motor's current.
+        read: [rad/s] last reading of the speed that was used.
+        at_pulse: [rad] rotor angle when that reading was new.
+        outliers: number of outliers in a row.
+        samples: number of samples.
+    """
 
-
-MOTOR = _Motor()
+    voltage: float = 0.0
+    current: float = 0.0
+    read: float = 0.0
+    at_pulse: float = 0.0
+    outliers: int = 0
+    samples: int = 0
 
 HISTORY = 512
 """Samples for which the angle of the rotor is kept: longer than the longest time between pulses that is read."""
@@ -105,7 +117,7 @@ class Observer:
         self.count = 0
         self._memory = sensing.NOTHING_READ
         self._duty = duty
-        self._known = np.zeros(len(MOTOR))
+        self._motor = MotorCorrection()
         self._angles = np.zeros(HISTORY)
         self._queue = deque([self._voltage(duty)] * self._whole)
         self.state: dynamics.State | None = None if math.isnan(theta) else self._start(theta)
@@ -113,12 +125,12 @@ class Observer:
     @property
     def voltage_bias(self) -> float:
         """V that the motor seems to get beside what the model says."""
-        return float(self._known[MOTOR.voltage])
+        return self._motor.voltage
 
     @property
     def current_bias(self) -> float:
         """A that the motor seems to draw beside what the model says."""
-        return float(self._known[MOTOR.current])
+        return self._motor.current
 
     def step(self, theta: float, duty: float, omega: float = math.nan, i_a: float = math.nan) -> Estimate:
         """Take a reading, with the duty that is applied from it on.
@@ -139,8 +151,9 @@ class Observer:
         self._queue.popleft()
         self.count += 1
         if self.motor:
-            self.state = _correct_motor(omega, i_a, self.state, self._known, self._angles, self._chain, self._per_volt)
-            volts = np.maximum(volts + self._known[MOTOR.voltage], 0.0)
+            self.state, self._motor = _correct_motor(omega, i_a, self.state, self._motor, self._angles, self._chain,
+                                                     self._per_volt)
+            volts = np.maximum(volts + self._motor.voltage, 0.0)
         self.state, self._memory, estimate = _observe(theta, volts, self.state, self._memory, self._gain, self._chain,
                                                       *self.plant)
         return Estimate(*estimate)
@@ -183,45 +196,43 @@ def _observe(theta: float, volts: Array, s: dynamics.State, m: sensing.Memory, g
 
 
 @njit(nogil=True)
-def _correct_motor(omega: float, i_a: float, s: dynamics.State, known: Array, angles: Array,
-                   chain: sensing.MeasurementChain, per_volt: float) -> dynamics.State:
-    """The state after the readings of speed and current; `known` and `angles` (a ring of samples) are updated."""
-    k = int(known[MOTOR.samples])
-    known[MOTOR.samples] += 1.0
+def _correct_motor(omega: float, i_a: float, s: dynamics.State, m: MotorCorrection, angles: Array,
+                   chain: sensing.MeasurementChain, per_volt: float) -> tuple[dynamics.State, MotorCorrection]:
+    """State and correction after the readings of speed and current; `angles` (ring of samples) is updated."""
+    k = m.samples
+    voltage, current, read, at_pulse, outliers = m.voltage, m.current, m.read, m.at_pulse, m.outliers
     angles[k % HISTORY] = s.rotor_angle
     if not math.isnan(i_a):
         more = (i_a - chain.current_bias) / chain.current_factor - s.i_a
-        known[MOTOR.current] += (more - known[MOTOR.current]) * -math.expm1(-chain.h / CURRENT_TIME)
-    if math.isnan(omega):
-        return s
-    time, error = chain.h, omega - s.omega
-    if chain.pulses > 0.0:
+        current += (more - current) * -math.expm1(-chain.h / CURRENT_TIME)
+    use, time, error = not math.isnan(omega), chain.h, omega - s.omega
+    if use and chain.pulses > 0.0:
         turn = 2.0 * math.pi / chain.pulses
         if omega == 0.0:
-            if s.rotor_angle - known[MOTOR.at_pulse] < 3.0 * turn:
-                return s  # too early for a reading
+            use = s.rotor_angle - at_pulse >= 3.0 * turn  # else it is too early for a reading
+        elif omega == read:
+            use = False  # held, and used already
         else:
-            if omega == known[MOTOR.read]:
-                return s  # held, and used already
-            known[MOTOR.read], known[MOTOR.at_pulse] = omega, s.rotor_angle
+            read, at_pulse = omega, s.rotor_angle
             time = turn / omega
-            first = k - 0.5 - time / chain.h  # the pulse came, on average, half a period ago
-            if first < 0.0 or time / chain.h > HISTORY - 2:
-                return s
-            error = omega - (_at(angles, k - 0.5) - _at(angles, first)) / time
-    limit = OUTLIER[0] * s.omega + OUTLIER[1]
-    if abs(error) > limit:
-        known[MOTOR.outliers] += 1.0
-        if known[MOTOR.outliers] < 3.0:
-            return s
-        error = math.copysign(limit, error)
-    else:
-        known[MOTOR.outliers] = 0.0
-    share = -math.expm1(-time / SPEED_TIME)
-    known[MOTOR.voltage] += share * error / per_volt
-    known[MOTOR.voltage] = min(max(known[MOTOR.voltage], -1.0), 1.0)
-    return dynamics.State(s.i_a, max(s.omega + share * error, 0.0), s.rotor_angle, s.theta, s.theta_dot, s.thrust,
-                          s.heat, s.flex, s.flex_dot, s.gust)
+            first = k - 0.5 - time / chain.h  # the pulse came half a period ago, on average
+            use = first >= 0.0 and time / chain.h <= HISTORY - 2
+            if use:
+                error = omega - (_at(angles, k - 0.5) - _at(angles, first)) / time
+    if use:
+        limit = OUTLIER[0] * s.omega + OUTLIER[1]
+        if abs(error) > limit:
+            outliers += 1
+            use = outliers >= OUTLIERS_BELIEVED
+            error = math.copysign(limit, error)
+        else:
+            outliers = 0
+    if use:
+        share = -math.expm1(-time / SPEED_TIME)
+        voltage = min(max(voltage + share * error / per_volt, -LARGEST_BIAS), LARGEST_BIAS)
+        s = dynamics.State(s.i_a, max(s.omega + share * error, 0.0), s.rotor_angle, s.theta, s.theta_dot, s.thrust,
+                           s.heat, s.flex, s.flex_dot, s.gust)
+    return s, MotorCorrection(voltage, current, read, at_pulse, outliers, k + 1)
 
 
 @njit(nogil=True)

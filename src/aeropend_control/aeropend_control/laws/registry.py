@@ -7,13 +7,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from aeropend_control.analysis.closed_loop import Law
-from aeropend_control.analysis.tuning import TABLE_6_1, Requirements, TuningError
 from aeropend_control.laws import cascade, feedback_linearization, small_signal
 from aeropend_control.laws.cascade import Cascade, FeedbackLinearizationCascade
 from aeropend_control.laws.feedback_linearization import FeedbackLinearization
 from aeropend_control.laws.gains import Gain, GainError
+from aeropend_control.laws.law import Law
 from aeropend_control.laws.small_signal import SmallSignal
+from aeropend_control.laws.tuning import TABLE_6_1, Requirements, TuningError
 from aeropend_sim.model.parameters import Model
 
 __all__ = ["LAWS", "TABLE_6_1", "Gain", "GainError", "Law", "LawKind", "Requirements", "TuningError"]

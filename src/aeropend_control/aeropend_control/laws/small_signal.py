@@ -14,17 +14,18 @@ import math
 from collections.abc import Mapping
 from typing import ClassVar
 
-from aeropend_control.analysis.tuning import (
+from aeropend_control.laws.gains import Gain
+from aeropend_control.laws.observer import Estimate
+from aeropend_control.laws.position import NEVER, TRACKING_TIME, PositionLaw
+from aeropend_control.laws.tuning import (
     OPERATING_POINT,
     OVERSHOOT_SHARE,
     TABLE_6_1,
     Requirements,
+    arm_stiffness,
     place,
     settling_time,
 )
-from aeropend_control.laws.gains import Gain
-from aeropend_control.laws.observer import Estimate
-from aeropend_control.laws.position import NEVER, TRACKING_TIME, PositionLaw
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 
 THESIS_GAINS = {"kp": 0.04, "ki": 0.993, "kd": -0.0086, "setpoint_weight": 1.0, "tracking_time": NEVER,
@@ -64,7 +65,7 @@ class SmallSignal(PositionLaw):
         M_p = OVERSHOOT_SHARE * requirements.M_p
         kp, ki, kd, weight, thrust_time = place(model, REACH * settling_time(requirements, M_p), M_p)
         n = model.numbers()
-        stiffness, per = _stiffness(model, OPERATING_POINT), 1.0 / n["L_over_J"]
+        stiffness, per = arm_stiffness(model, OPERATING_POINT), 1.0 / n["L_over_J"]
         # with gravity left to the PID kp loses what gravity gives; the reference acts through the feedforward alone
         return {"kp": per * (kp - stiffness), "ki": per * ki, "kd": per * kd, "setpoint_weight": 0.0,
                 "feedforward": min(1.0, weight * kp / stiffness), "thrust_time": thrust_time}
@@ -78,20 +79,15 @@ class SmallSignal(PositionLaw):
             return
         self._scheduled = reference
         g, per = self.gains, 1.0 / self._numbers["L_over_J"]
-        less = _stiffness(self.model, OPERATING_POINT) - _stiffness(self.model, reference)
+        less = arm_stiffness(self.model, OPERATING_POINT) - arm_stiffness(self.model, reference)
         self._pid.retune(g["kp"] + per * less, g["ki"], g["kd"], setpoint_weight=g["setpoint_weight"],
                          tracking_time=g["tracking_time"])
 
     def _thrust(self, u: float, reference: float, estimate: Estimate) -> float:
         n, s = self._numbers, estimate.state
-        held = self.gains["feedforward"] * _stiffness(self.model, OPERATING_POINT) * reference
+        held = self.gains["feedforward"] * arm_stiffness(self.model, OPERATING_POINT) * reference
         effects = estimate.drive - estimate.nominal_drive - self._friction(reference, s)
         return (u + (held - effects) / n["L_over_J"]) / (1.0 + estimate.ground)
 
     def _per_thrust(self, estimate: Estimate) -> float:
         return 1.0 + estimate.ground
-
-
-def _stiffness(model: Model, at: float) -> float:
-    """What gravity's torque over the inertia grows per rad around an angle, 1/s²."""
-    return float(model.numbers()["mgd_over_J"]) * math.cos(at)

@@ -225,7 +225,7 @@ class Controller(Node):
         start = time.monotonic_ns()
         self._heard, self._quiet = True, 0
         supervisor = self._supervisor
-        supervisor.applied(applied)
+        supervisor.note_applied(applied)
         duty = supervisor.step(stamp, Sample(theta, omega, i_a, v_a))
         if duty is not None:
             self._publisher.publish(wire.float64(duty))
@@ -236,7 +236,7 @@ class Controller(Node):
     def _on_reference(self, message: Float64) -> None:
         supervisor = self._supervisor
         before = supervisor.reference
-        if not supervisor.refer(message.data):
+        if not supervisor.set_reference(message.data):
             self._say(supervisor.refusal)
         elif supervisor.reference != before:
             self.get_logger().info(f"reference {supervisor.reference:g} {self._kind.reference_unit}")
@@ -247,7 +247,7 @@ class Controller(Node):
         supervisor = self._supervisor
         if self._heard and self._quiet * WATCH_S > supervisor.timeout:
             self._heard = False
-            supervisor.silent()
+            supervisor.on_timeout()
             self._publisher.publish(Float64(data=0.0))
             self._say(supervisor.fault)
 

@@ -7,14 +7,14 @@ import math
 from collections import Counter
 from collections.abc import Iterable
 
-from aeropend_control.analysis.closed_loop import Law
+from aeropend_control.laws.law import Law
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 from aeropend_sim.model.rig import Sample
 
 LOST = Sample(math.nan, math.nan, math.nan, math.nan)
 """What a law is given for a sample that never came."""
 
-NOTICED = 0.01
+LEAST_DUTY = 0.01
 """A rig that applies none of a duty below this may have rounded it to 0."""
 
 
@@ -51,15 +51,15 @@ class Supervisor:
         self._measures = [Sample._fields.index(name) for name in dict.fromkeys(["theta", *measures])]
         self.reference, self.duty, self.fault, self.refusal = math.nan, 0.0, "", ""
         self.counts = Counter(dict.fromkeys(("samples", "lost", "repeated", "refused"), 0))
-        self._kind = ""
+        self._fault_kind = ""
         self._stamp: int | None = None
         self._applied = 0.0
-        self._bad = 0  # samples in a row that could not be used
-        self._ignored = 0  # samples in a row to which the rig had applied nothing of a duty
+        self._unusable = 0  # samples in a row that could not be used
+        self._without_effect = 0  # samples in a row to which the rig had applied nothing of a duty
         self._tripped = False
         self.law.reset()
 
-    def refer(self, reference: float) -> bool:
+    def set_reference(self, reference: float) -> bool:
         """Take a new reference; False when it is refused, which leaves the one before."""
         if not self.low <= reference <= self.high:  # NaN neither
             self.refusal = f"reference {reference:g} refused: give {self.low:g} to {self.high:g} {self.unit}"
@@ -70,19 +70,19 @@ class Supervisor:
         self.reference, self.refusal, self._tripped = reference, "", False
         return True
 
-    def applied(self, duty: float) -> None:
+    def note_applied(self, duty: float) -> None:
         """Note what the rig says it applies; called for each sample that says so."""
         self._applied = duty if math.isfinite(duty) else 0.0
         if duty > 0.0:
-            self._ignored = 0
-        elif self.duty > NOTICED:
-            self._ignored += 1
+            self._without_effect = 0
+        elif self.duty > LEAST_DUTY:
+            self._without_effect += 1
 
-    def silent(self) -> None:
+    def on_timeout(self) -> None:
         """Note that no sample has come for `timeout`: the duty is 0, and the law starts anew."""
-        self.duty, self._bad, self._ignored = 0.0, 0, 0
+        self.duty, self._unusable, self._without_effect = 0.0, 0, 0
         self.law.reset()
-        self._state("silent", f"no sample for {self.timeout:g} s: duty 0")
+        self._set_fault("silent", f"no sample for {self.timeout:g} s: duty 0")
 
     def step(self, stamp_ns: int, sample: Sample) -> float | None:
         """Take a sample and return the duty to send; None for a sample that was there before.
@@ -91,13 +91,13 @@ class Supervisor:
             stamp_ns: instant of sampling, ns.
             sample: NaN where there is no reading.
         """
-        if not self._follows(stamp_ns):
+        if not self._is_new(stamp_ns):
             return None
         self.counts["samples"] += 1
-        self.duty = self._decide(sample)
+        self.duty = self._duty_for(sample)
         return self.duty
 
-    def _follows(self, stamp_ns: int) -> bool:
+    def _is_new(self, stamp_ns: int) -> bool:
         """Whether this sample is news; the law is told of those lost before it."""
         before, self._stamp = self._stamp, stamp_ns
         if before is None:
@@ -119,40 +119,42 @@ class Supervisor:
                 self.law.step(LOST, self.reference)
         return True
 
-    def _decide(self, sample: Sample) -> float:
+    def _duty_for(self, sample: Sample) -> float:
         missing = [Sample._fields[at] for at in self._measures if not math.isfinite(sample[at])]
         if missing:
-            self._state("unusable", f"{' and '.join(missing)} of a sample is NaN: duty 0")
-            self._bad += 1
+            self._set_fault("unusable", f"{' and '.join(missing)} of a sample is NaN: duty 0")
+            self._unusable += 1
             if not self._tripped and not math.isnan(self.reference):
-                if self._bad * self.period > self.timeout:
+                if self._unusable * self.period > self.timeout:
                     self.law.reset()
                 else:
                     self.law.step(LOST, self.reference)
             return 0.0
-        self._bad = 0
+        self._unusable = 0
         if abs(sample.theta) > self.angle_limit:
             self._tripped = True
         if self._tripped:
-            self._state("angle limit", f"the angle went beyond the limit of {self.angle_limit:g} rad: duty 0 until the "
-                        "next reference")
+            self._set_fault("angle limit", f"the angle went beyond the limit of {self.angle_limit:g} rad: duty 0 "
+                            "until the next reference")
             return 0.0
         if math.isnan(self.reference):
-            self._state("no reference", "no reference yet: duty 0")
+            self._set_fault("no reference", "no reference yet: duty 0")
             return 0.0
-        off = self._ignored * self.period > self.timeout
+        off = self._without_effect * self.period > self.timeout
         if off:
             self.law.reset()
         duty = self.law.step(sample, self.reference)
         if not math.isfinite(duty):
             self.law.reset()
-            self._state("law", "the law has no duty for this sample: duty 0")
+            self._set_fault("law", "the law has no duty for this sample: duty 0")
             return 0.0
-        self._state(*("off", "the rig applies duty 0: it is off (service enable), or somebody else commands it") if off
-                    else ("", ""))
+        if off:
+            self._set_fault("off", "the rig applies duty 0: it is off (service enable), or somebody else commands it")
+        else:
+            self._set_fault("", "")
         return min(max(duty, 0.0), 1.0)
 
-    def _state(self, kind: str, fault: str) -> None:
-        if kind and kind != self._kind:
+    def _set_fault(self, kind: str, fault: str) -> None:
+        if kind and kind != self._fault_kind:
             self.counts[kind] += 1
-        self._kind, self.fault = kind, fault
+        self._fault_kind, self.fault = kind, fault

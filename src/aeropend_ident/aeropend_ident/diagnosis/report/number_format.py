@@ -7,6 +7,8 @@ import math
 import re
 from typing import NamedTuple
 
+from aeropend_sim.cli.axis import multiples, tick_step
+
 
 def quantity(value: float | None, unit: str = "", digits: int = 3) -> str:
     """A number to some significant digits with its unit: `0.0320 rad`, `1.78 × 10⁻⁵ kg·m²`, or a dash for none."""
@@ -111,9 +113,7 @@ def ticks(low: float, high: float, about: int) -> list[Tick]:
         high: value at its upper end.
         about: number of ticks, roughly.
     """
-    raw = (high - low) / about
-    base = 10.0 ** math.floor(math.log10(raw))
-    step = next(m * base for m in (1.0, 2.0, 5.0, 10.0) if m * base >= raw * 0.999)
+    step = tick_step(low, high, about, tolerance=0.001)
     decimals = max(0, -math.floor(math.log10(step) + 1e-9))
     return [Tick(100.0 * (k * step - low) / (high - low), fixed(k * step, 0, decimals))
-            for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
+            for k in multiples(low, high, step)]

@@ -114,7 +114,7 @@ def place(model: Model, t_s: float, M_p: float, at: float = OPERATING_POINT, oth
     """
     decay, omega_2 = pair(t_s, M_p)
     n = model.numbers()
-    c, g = n["c_over_J"], n["mgd_over_J"] * math.cos(at)
+    c, g = n["c_over_J"], arm_stiffness(model, at)
     own = thrust_lag(model, at)
     lag = 1.0 / max(2.0 * (1.0 + other_poles) * decay - c, 1.0 / LONGEST_LAG)
     thrust_time = lag if lag < own else 0.0
@@ -127,6 +127,19 @@ def place(model: Model, t_s: float, M_p: float, at: float = OPERATING_POINT, oth
     kp = lag * (2.0 * p * omega_2 + 2.0 * decay * p * p)
     ki = lag * omega_2 * p * p
     return Placed(kp, ki, kd, ki / (kp * p), thrust_time)
+
+
+def arm_stiffness(model: Model, at: float) -> float:
+    """Stiffness of the linearised arm: derivative of gravity's torque over the inertia, with respect to the angle.
+
+    Args:
+        model: the model of the rig.
+        at: [rad] angle around which the arm is linearised.
+
+    Returns:
+        [1/s²] (mgd/J) cos(at).
+    """
+    return float(model.numbers()["mgd_over_J"]) * math.cos(at)
 
 
 def thrust_lag(model: Model, at: float) -> float:
