@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The control laws and what they are made of; nothing here knows ROS."""
+"""The control laws, their parts, and their tuning. Nothing here depends on ROS."""

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cascade control of the rotor's speed (thesis 6.7), alone and behind feedback linearization (6.8).
 
-A PI on the speed asks for a current, within a limit; a PI on the current asks for a voltage. Speed and current are the
-observer's, which knows that the speed is read late and held (see `observer.Observer`). The feedforward gives what holds
-speed and current by the model, with the effects that it names and with what the observer found missing, so that tuned
-loops leave no error without integrals of their own, which would wind up; 0 leaves all to the integrals, as in the
-thesis.
+A PI controller of the speed sets the demanded current, within a limit; a PI controller of the current sets the voltage.
+Speed and current are estimates of the observer, which models that the reading of the speed is late and held (see
+`observer.Observer`). The feedforward gives the steady current and voltage of the model, with its effects and with the
+biases that the observer estimates. So tuned loops have no steady-state error although their integral gains are 0, and
+there is no windup. With a feedforward of 0 the integrals do all this, as in the thesis.
 """
 
 from __future__ import annotations
@@ -27,68 +27,89 @@ from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 from aeropend_sim.model.rig import Sample
 
 GAINS = {
-    "speed_kp": Gain("A·s/rad", 0.0, 100.0, None, "proportional gain, from speed to current"),
+    "speed_kp": Gain("A·s/rad", 0.0, 100.0, None, "proportional gain from speed to current"),
     "speed_ki": Gain("A/rad", 0.0, 1e3, None, "integral gain of the speed"),
-    "current_kp": Gain("V/A", 0.0, 100.0, None, "proportional gain, from current to voltage"),
+    "current_kp": Gain("V/A", 0.0, 100.0, None, "proportional gain from current to voltage"),
     "current_ki": Gain("V/A/s", 0.0, 1e4, None, "integral gain of the current"),
-    "current_limit": Gain("A", 0.0, 100.0, 2.0, "current asked for at most"),
-    "feedforward": Gain("-", 0.0, 1.0, 1.0, "share given at once of what holds speed and current by the model"),
+    "current_limit": Gain("A", 0.0, 100.0, 2.0, "limit of the demanded current"),
+    "feedforward": Gain("-", 0.0, 1.0, 1.0, "share of the model's steady current and voltage that is fed forward"),
 }
-"""Those of the cascade."""
+"""Gains of the cascade."""
 
 THESIS_GAINS = {"speed_kp": 0.1, "speed_ki": 1.5, "current_kp": 1.2, "current_ki": 0.5, "current_limit": 2.0,
                 "feedforward": 0.0}
-"""The thesis' own (6.7); its limit of the current is not printed, 2 A is the motor shield's."""
+"""Gains of the thesis (6.7). The thesis does not print its current limit; 2 A is the limit of its motor shield."""
 
 REQUIREMENTS = Requirements(t_r=0.2, t_p=0.8, t_s=0.8, M_p=0.1)
-"""What the thesis says of a step to 950 RPM (6.7); nothing of t_p."""
+"""Requirements of the thesis for a step to 950 RPM (6.7). It has none on t_p; that of 0.8 s is not used."""
 
 MOTION, STIFFNESS, SOFT = 7.8, 5.1, 2.0
-"""For Table 6.1 and t_s 1.2 s: rad/s of the motion to follow after a step, and of the tuned loop behind it, whose other
-poles are so many times faster (`tuning.OTHER_POLES`)."""
+"""[rad/s], [rad/s], [-] For Table 6.1 with t_s = 1.2 s: frequency of the reference model; frequency of the dominant
+pole pair of the feedback loop; ratio of the decay of its other poles to that of the pair (compare
+`tuning.OTHER_POLES`). Choices; `tune` shows the margins and step responses with them."""
 
 CURRENT_LEAD = 3.0
-"""How many times quicker than the speed the current follows at least."""
+"""Least ratio of the speed loop's time constant to the current loop's (choice; 3 to 5 is usual in cascades)."""
 
 OUT_OF_REACH = 0.5
-"""rad/s² by which the limits may miss what is wanted before the motion to follow is begun anew."""
+"""[rad/s²] Acceleration lost to the limits of the duty above which the reference model restarts (choice)."""
 
 CURRENT_SHARE = 0.3
-"""Gain of a tuned current loop as a share of the winding's resistance: more does not bear an unknown delay."""
+"""Gain of a tuned current loop as a share of the winding's resistance (choice; a larger gain leaves too little delay
+margin for a command delay that the model does not have)."""
 
 
 class SpeedLoop:
-    """Speed PI, current limit, current PI, and the voltage's way to the duty."""
+    """Speed PI, current limit, current PI, and the duty for the demanded voltage."""
 
     def __init__(self, observer: Observer, allocation: Allocation) -> None:
+        """Prepare the loops; `retune` must follow.
+
+        Args:
+            observer: gives the biases of the motor.
+            allocation: gives steady current, voltage drop and duty.
+        """
         self._observer, self._allocation = observer, allocation
         self._numbers = observer.model.numbers()
         n = self._numbers
-        # friction that stops the rotor sooner than the current changes is not to be taken back at the present speed
+        # a rotor that stops faster than its current changes: compensating friction at the present speed is unstable
         self._light = n["J_m"] * n["R_a"] < n["B_m"] * n["L_a"]
         self._speed, self._current = PID(0.0, period=observer.period), PID(0.0, period=observer.period)
 
     def retune(self, gains: Mapping[str, float]) -> None:
-        """Take gains by the names of `GAINS`, without a bump."""
+        """Change the gains (by the names of `GAINS`) without a bump."""
         self._speed.retune(gains["speed_kp"], gains["speed_ki"])
         self._current.retune(gains["current_kp"], gains["current_ki"])
         self._limit, self._feedforward, self._kp = gains["current_limit"], gains["feedforward"], gains["speed_kp"]
         self._slope = gains["current_kp"] + self._feedforward * self._numbers["R_a"]
 
     def reset(self) -> None:
-        """Forget the past."""
+        """Set the integrals to 0."""
         self._speed.reset()
         self._current.reset()
 
     def align(self, reference: float, s: dynamics.State) -> None:
-        """Go on without a bump from the voltage that holds the state, with this reference next."""
+        """Set the integrals so that the loop continues without a bump from the steady voltage of a state.
+
+        Args:
+            reference: [rad/s] the next reference of the speed.
+            s: the state.
+        """
         held = self._allocation.holding_current(s.omega, s.omega)
         free = 1.0 - self._feedforward
         self._speed.align(free * held, reference, s.omega)
         self._current.align(free * (self._numbers["K_e"] * s.omega + self._allocation.drop(held, s)), held, held)
 
     def duty(self, reference: float, s: dynamics.State) -> tuple[float, float]:
-        """Duty for a speed (rad/s) in a state, and the speed that would have asked for what the limits leave."""
+        """Duty for a demanded speed; call it once a sample.
+
+        Args:
+            reference: [rad/s] demanded speed.
+            s: state of the rig.
+
+        Returns:
+            The duty [0..1], and the speed [rad/s] whose demand the limits of current and duty would have let through.
+        """
         a, observer = self._allocation, self._observer
         u = self._speed.step(reference, s.omega, 0.0)
         bias = observer.current_bias
@@ -105,15 +126,20 @@ class SpeedLoop:
 
 
 class Cascade:
-    """The law of the rotor's speed, for a model; see the module. Duty 0..1 out, reference in rad/s."""
+    """The law of the rotor's speed; see the module. Output: duty, 0..1; reference in rad/s."""
 
     parameters: ClassVar[dict[str, Gain]] = GAINS
 
     def __init__(self, model: Model, gains: Mapping[str, float] | None = None, period: float = SAMPLE_PERIOD) -> None:
-        """Take the model file's model; gains that are not given are those that `tune` gives for it.
+        """Prepare the law for a model.
+
+        Args:
+            model: the model of the rig.
+            gains: by name; missing ones come from `tune`.
+            period: [s] between samples.
 
         Raises:
-            GainError: a gain that cannot be used.
+            GainError: a gain cannot be used.
         """
         given = checked(self.parameters, gains or {})
         self.model, self.gains = model, {**self.tune(model), **given}
@@ -124,27 +150,35 @@ class Cascade:
 
     @staticmethod
     def tune(model: Model, requirements: Requirements = REQUIREMENTS) -> dict[str, float]:
-        """Gains that meet requirements with a reserve, where the limits of voltage and current allow it."""
+        """Gains that meet requirements with a reserve, if the limits of voltage and current allow it.
+
+        Args:
+            model: the model of the rig.
+            requirements: on the step response.
+        """
         follow = TIME_SHARE * min(requirements.t_r / 2.2, requirements.t_s / 4.0)
         return {**_defaults(), **tune(model, follow)}
 
     def reset(self, sample: Sample | None = None, duty: float = 0.0) -> None:
-        """As `closed_loop.Law`."""
+        """See `law.Law`."""
         self._observer.reset(duty, 0.0 if sample is None else sample.theta)
         self._loop.reset()
         self._duty, self._bumpless = duty, duty > 0.0
 
     def retune(self, gains: Mapping[str, float]) -> None:
-        """As `closed_loop.Law`."""
+        """See `law.Law`."""
         self.gains = {**self.gains, **checked(self.parameters, gains)}
         self._loop.retune(self.gains)
 
     def step(self, sample: Sample, reference: float) -> float:
-        """Take a sample and return the duty (0..1) to apply from the next sample on.
+        """Process a sample.
 
         Args:
-            sample: NaN where a reading was lost.
-            reference: rad/s, finite.
+            sample: the readings; NaN where a reading is missing.
+            reference: [rad/s] finite.
+
+        Returns:
+            [0..1] The duty to apply from the next sample on.
         """
         s = self._observer.step(sample.theta, self._duty, sample.omega, sample.i_a).state
         if self._bumpless:
@@ -155,31 +189,35 @@ class Cascade:
 
 
 class FeedbackLinearizationCascade(FeedbackLinearization):
-    """Feedback linearization whose thrust is held by the cascade on the rotor's speed.
+    """Feedback linearization whose thrust is controlled by the cascade of the rotor's speed.
 
-    The PID's reference is the motion of a reference model, which the law knows the acceleration and jerk of: so the
-    answer to a step is set apart from how hard the PID reacts, and that can keep its distance from instability.
+    The reference of the PID is the output of a reference model, whose acceleration and jerk are fed forward. So the
+    step response does not depend on the gains of the PID, and these can be low enough for good stability margins.
     """
 
     reads_motor: ClassVar[bool] = True
     parameters: ClassVar[dict[str, Gain]] = {
         **feedback_linearization.GAINS,
-        "reference_time": Gain("s", 0.0, 10.0, None, "1/ω of the motion to follow after a step; 0: the step itself"),
-        "thrust_time": Gain("s", 0.0, 1.0, None, "time in which the thrust follows; 0: as quick as the cascade is"),
+        "reference_time": Gain("s", 0.0, 10.0, None, "1/ω of the reference model; 0: none"),
+        "thrust_time": Gain("s", 0.0, 1.0, None, "time constant of the thrust; 0: that of the cascade"),
         **GAINS}
 
     def __init__(self, model: Model, gains: Mapping[str, float] | None = None, period: float = SAMPLE_PERIOD) -> None:
-        """As `PositionLaw`."""
+        """Prepare the law; see `PositionLaw`."""
         self._loop: SpeedLoop | None = None
         self._reference_model = ReferenceModel(0.0, period)
         super().__init__(model, gains, period)
 
     @classmethod
     def tune(cls, model: Model, requirements: Requirements = TABLE_6_1) -> dict[str, float]:
-        """Gains that meet requirements with a reserve, with little overshoot.
+        """Gains that meet requirements with a reserve and with little overshoot.
+
+        Args:
+            model: the model of the rig.
+            requirements: on the step response.
 
         Raises:
-            TuningError: one line that says which requirement cannot be met.
+            TuningError: a requirement cannot be met; one line that names it.
         """
         air = model.effect("thrust_lag", "tau")
         slower = min(requirements.t_r / 0.5, requirements.t_p / 0.9, requirements.t_s / 1.2)
@@ -193,7 +231,7 @@ class FeedbackLinearizationCascade(FeedbackLinearization):
                 **tune(model, follow - min(air, 0.5 * follow))}
 
     def reset(self, sample: Sample | None = None, duty: float = 0.0) -> None:
-        """As `closed_loop.Law`."""
+        """See `law.Law`."""
         super().reset(sample, duty)
         self._fresh = True
         if self._loop is not None:
@@ -213,12 +251,12 @@ class FeedbackLinearizationCascade(FeedbackLinearization):
         if self._fresh:
             self._fresh = False
             self._reference_model.reset(s.theta)
-        elif abs(self._missed) > OUT_OF_REACH:  # go on from where the arm is
+        elif abs(self._missed) > OUT_OF_REACH:  # continue from the state of the arm
             acceleration = estimate.drive + self._per_thrust(estimate) * s.thrust
             self._reference_model.reset(s.theta, s.theta_dot, acceleration)
         y, rate, acceleration, jerk = self._reference_model.step(reference)
         c, g, follow = self._numbers["c_over_J"], self._numbers["mgd_over_J"], self.gains["thrust_time"]
-        late = follow * (jerk + c * acceleration + g * math.cos(y) * rate)  # what a thrust that follows would lack
+        late = follow * (jerk + c * acceleration + g * math.cos(y) * rate)  # compensates the lag of the thrust
         return y, acceleration + c * rate + late + self.gains["kd"] * rate
 
     def _drive(self, thrust: float, s: dynamics.State) -> tuple[float, float]:
@@ -234,7 +272,12 @@ def _defaults() -> dict[str, float]:
 
 
 def tune(model: Model, follow: float) -> dict[str, float]:
-    """Gains of both PIs with which the speed follows in `follow` s."""
+    """Gains of both PI controllers.
+
+    Args:
+        model: the model of the rig.
+        follow: [s] time constant with which the speed follows its reference.
+    """
     n = model.numbers()
     return {"speed_kp": n["J_m"] / (n["K_t"] * follow), "speed_ki": 0.0,
             "current_kp": max(CURRENT_SHARE * n["R_a"], CURRENT_LEAD * n["L_a"] / follow), "current_ki": 0.0}

@@ -1,17 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Feedback linearization of the arm (thesis chapter 6), with any effect that the model file names.
+"""Feedback linearization of the arm (thesis chapter 6), for a model with any effects.
 
-The law f = (J/L)((mgd/J) sin y + v) leaves the plant 1/(s(s + c/J)) to a PID, whose output is v. Three parts:
+With the thrust f = (J/L)((mgd/J) sin y + v) the plant from v to the angle is 1/(s(s + c/J)). A PID controls this plant;
+its output is v. The law has three parts:
 
-- The observer is the model itself (`observer`), corrected by each reading of the angle. So the filter's lag,
-  quantisation, noise, and what the effects do to motion and reading are known to it: `angle_offset`,
-  `encoder_eccentricity` and `encoder_lag`, `command_delay`, and all that acts between the duty and the angle.
-- The law takes back what `dynamics.arm_drive` holds beside the thrust and the viscous friction, which are gravity,
-  `cable_torque`, `quadratic_drag` and `axial_inflow`, and beside it `coulomb_friction` and `ground_effect`; of
-  `mast_flex` only the observer knows. Under a `command_delay` it acts on the state in which the duty will find the arm.
-- The allocation (`allocation`) goes from thrust to speed, voltage and duty.
+- The observer (`observer`) runs the model and corrects it by each reading of the angle. So it accounts for the angle
+  filter, quantisation and noise, for `angle_offset`, `encoder_eccentricity`, `encoder_lag` and `command_delay`, and for
+  every effect between the duty and the angle.
+- The law compensates gravity, `cable_torque`, `quadratic_drag` and `axial_inflow` (the terms of `dynamics.arm_drive`
+  without thrust and viscous friction), `coulomb_friction` and `ground_effect`. Only the observer accounts for
+  `mast_flex`. With a `command_delay` the law uses the predicted state at the time when the duty acts.
+- The allocation (`allocation`) calculates speed, voltage and duty for the thrust.
 
-The law uses the angle only, so effects on the other readings do not reach it; a `gust` cannot be foreseen.
+The law reads the angle only. So effects on the other readings do not change it. A `gust` cannot be predicted.
 """
 
 from __future__ import annotations
@@ -32,30 +33,34 @@ from aeropend_control.laws.tuning import (
 from aeropend_sim.model.parameters import Model
 
 GAINS = {
-    "kp": Gain("1/s²", 0.0, 1e4, None, "proportional gain, from angle to acceleration"),
+    "kp": Gain("1/s²", 0.0, 1e4, None, "proportional gain from angle to acceleration"),
     "ki": Gain("1/s³", 0.0, 1e5, None, "integral gain"),
     "kd": Gain("1/s", -1e3, 1e3, None, "derivative gain"),
     "setpoint_weight": Gain("-", 0.0, 1.0, None, "share of the reference in the proportional part"),
     "tracking_time": TRACKING_TIME,
 }
-"""Those of the PID whose output is v, rad/s²."""
+"""Gains of the PID, whose output v is in rad/s²."""
 
 THESIS_GAINS = {"kp": 291.0, "ki": 436.0, "kd": 15.0, "setpoint_weight": 1.0, "tracking_time": NEVER}
-"""The thesis' own (6.6); in print ki and kd are swapped."""
+"""Gains of the thesis (6.6). The printed thesis has ki and kd swapped."""
 
 
 class FeedbackLinearization(PositionLaw):
-    """The law, for a model; see the module. Duty 0..1 out, reference and angle in rad."""
+    """The law; see the module. Output: duty, 0..1; reference and angle in rad."""
 
     parameters: ClassVar[dict[str, Gain]] = {
-        **GAINS, "thrust_time": Gain("s", 0.0, 1.0, None, "time in which the thrust is made to follow; 0: the motor's")}
+        **GAINS, "thrust_time": Gain("s", 0.0, 1.0, None, "time constant of the thrust; 0: the motor's own")}
 
     @classmethod
     def tune(cls, model: Model, requirements: Requirements = TABLE_6_1) -> dict[str, float]:
         """Gains that meet requirements with a reserve.
 
+        Args:
+            model: the model of the rig.
+            requirements: on the step response.
+
         Raises:
-            TuningError: one line that says which requirement cannot be met.
+            TuningError: a requirement cannot be met; one line that names it.
         """
         M_p = OVERSHOOT_SHARE * requirements.M_p
         return tune(model, settling_time(requirements, M_p), M_p)
@@ -70,15 +75,15 @@ class FeedbackLinearization(PositionLaw):
 
 
 def tune(model: Model, t_s: float = 1.5, M_p: float = 0.1, at: float = OPERATING_POINT) -> dict[str, float]:
-    """Gains by pole placement for the model, linear around an angle (see `tuning.place`).
+    """Gains by pole placement for the linearised arm (see `tuning.place`).
 
     Args:
-        model: the model file's.
-        t_s: settling time to 2 %, s.
-        M_p: overshoot, 0 < M_p < 1.
-        at: angle, rad.
+        model: the model of the rig.
+        t_s: [s] settling time to 2 %.
+        M_p: overshoot as a share, 0 < M_p < 1.
+        at: [rad] angle around which the arm is linearised.
 
     Raises:
-        TuningError: one line that says which requirement cannot be met.
+        TuningError: a requirement cannot be met; one line that names it.
     """
     return place(model, t_s, M_p, at)._asdict()

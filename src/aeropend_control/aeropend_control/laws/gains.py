@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a gain is, and the check of gains that a person gives."""
+"""Gains of a law: unit, range, default and meaning; and the check of given values."""
 
 from __future__ import annotations
 
@@ -10,14 +10,19 @@ from dataclasses import dataclass
 
 
 class GainError(ValueError):
-    """A gain that cannot be used; the message is one line for a person."""
+    """A gain cannot be used; the message is one line for the user."""
 
 
 @dataclass(frozen=True)
 class Gain:
-    """A number that tunes a law: its unit, the range that makes sense, what it is if nobody says, what it means.
+    """A gain or another tuning parameter of a law.
 
-    A `default` of None is computed from the model file.
+    Attributes:
+        unit: of the value; "-" for none.
+        low: least value.
+        high: greatest value.
+        default: value if none is given; None: computed from the model.
+        description: meaning, for `--help`.
     """
 
     unit: str
@@ -28,10 +33,17 @@ class Gain:
 
 
 def checked(known: Mapping[str, Gain], given: Mapping[str, float]) -> dict[str, float]:
-    """The gains given, as floats.
+    """Check given gains.
+
+    Args:
+        known: the gains of the law, by name.
+        given: values by name.
+
+    Returns:
+        The given values as floats.
 
     Raises:
-        GainError: one line that says which gain is unknown, not a number or out of its range.
+        GainError: a gain is unknown, not a number or out of its range; one line that names it.
     """
     return {name: _check(known, name, value) for name, value in given.items()}
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The model, run beside the rig and corrected by its readings: what the laws know of the rig's state."""
+"""State observer: the model runs in parallel with the rig and is corrected by the readings."""
 
 from __future__ import annotations
 
@@ -19,16 +19,18 @@ from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 Array = NDArray[np.float64]
 
 DISTURBANCE = 2.0
-"""rad/s² per √s: how fast the observer expects unknown torque to wander. More: quicker, and more noise in the rate."""
+"""[rad/s² per √s] Intensity of the random walk that models the unknown torque (choice). A larger value
+makes the estimate faster and noisier."""
 
 SPEED_TIME = 0.25
-"""s over which the speed of the rotor is corrected by its reading."""
+"""[s] Time constant of the correction of the rotor's speed by its reading (choice)."""
 
 CURRENT_TIME = 0.05
-"""s over which the current is corrected by its reading."""
+"""[s] Time constant of the correction of the current by its reading (choice)."""
 
 OUTLIER = (0.2, 5.0)
-"""A speed further off than this share and this much (rad/s) is believed only with the third such reading."""
+"""[-], [rad/s] A reading of the speed is an outlier if it differs from the estimate by more than this share of it plus
+this value (choice)."""
 
 OUTLIERS_BELIEVED = 3
 """Number of outliers in a row from which on they are used, limited to the bound of `OUTLIER` (choice)."""
@@ -37,19 +39,19 @@ LARGEST_BIAS = 1.0
 """[V] Bound of the bias of the motor's voltage (choice)."""
 
 LEAST_NOISE = 1e-4
-"""rad: readings are never trusted more than this, since no model is exact."""
+"""[rad] Least standard deviation that the observer assumes for a reading of the angle: no model is exact (choice)."""
 
 
 class Estimate(NamedTuple):
-    """What the observer says of an instant.
+    """An estimate of the observer.
 
     Attributes:
-        state: SI.
-        drive: what `dynamics.arm_drive` holds beside the thrust, rad/s²; dry friction, the observer's own estimate of
-            unknown torque and the mast are not in it. (A mast that swings is as good as rigid for slow motion, and
-            thrust is too late to take back what it does in quick motion: the observer alone knows of it.)
-        nominal_drive: the same without effects.
-        ground: share by which the ground effect raises the thrust.
+        state: SI units.
+        drive: [rad/s²] `dynamics.arm_drive` without thrust. It does not include dry friction, the estimate of the
+            unknown torque, and the bending of the mast. (In slow motion the mast is practically rigid; in fast motion
+            the thrust is too late to compensate it.)
+        nominal_drive: [rad/s²] the same without effects.
+        ground: share by which the ground effect increases the thrust.
     """
 
     state: dynamics.State
@@ -78,25 +80,31 @@ class MotorCorrection(NamedTuple):
     samples: int = 0
 
 HISTORY = 512
-"""Samples for which the angle of the rotor is kept: longer than the longest time between pulses that is read."""
+"""[samples] Length of the history of the rotor angle: more than the longest time between two pulses that is used."""
 
 
 class Observer:
-    """The model, run beside the rig and corrected by each reading of the angle, and if asked of the motor.
+    """The model in parallel with the rig, corrected by each reading of the angle and optionally of the motor.
 
-    Torque that it does not know appears as its `gust`. The gains are those of the stationary Kalman filter of the arm
-    and the angle filter for the reading's noise and quantisation.
+    The state `gust` of the model is the estimate of the unknown torque. The gains are those of the stationary Kalman
+    filter of the arm and the angle filter, for the noise and the quantisation of the reading.
 
-    The speed that is read is the mean over the last interval between pulses, late and held. It is compared with the
-    mean of the model's speed over that same interval, once; the difference corrects the speed and a voltage that
-    stands for what the model does not know of the motor. The difference of the currents is smoothed and added.
+    A reading of the speed is the mean over the last interval between two pulses; it is late and held. The observer
+    compares it once with the mean of the model's speed over the same interval. The difference corrects the speed and a
+    bias of the motor's voltage. The difference of the currents is low-pass filtered and is a bias of the current.
     """
 
     def __init__(self, model: Model, period: float = SAMPLE_PERIOD, motor: bool = False) -> None:
-        """Take the model file's model; `motor`: whether speed and current are read too."""
+        """Prepare the observer for a model.
+
+        Args:
+            model: the model of the rig.
+            period: [s] between samples.
+            motor: use the readings of speed and current too.
+        """
         self.model, self.period, self.motor = model, period, motor
         self.numbers = model.numbers()
-        steady = {"gust": {"sigma": 1e-9, "tau": 1e3}}  # never drawn: it holds the estimate, and all but keeps it
+        steady = {"gust": {"sigma": 1e-9, "tau": 1e3}}  # no random torque, only a state for the estimate
         c, e, x = dynamics.prepare(model.with_effects({**model.effects, **steady}), period)
         assert e is not None
         assert x is not None
@@ -108,12 +116,17 @@ class Observer:
         delay = model.effect("command_delay", "delay") / period
         self._whole = math.floor(delay + 1e-9)
         self._effects = dict(model.effects)
-        if delay > 0.0:  # whole periods of it are the queue's
+        if delay > 0.0:  # the queue delays by whole periods
             self._effects["command_delay"] = {"delay": max(delay - self._whole, 0.0) * period}
         self.reset()
 
     def reset(self, duty: float = 0.0, theta: float = math.nan) -> None:
-        """Start anew, at rest, from an angle (rad as read) or else the next; `duty` has been applied since long."""
+        """Restart at rest.
+
+        Args:
+            duty: [0..1] the duty that was constant for a long time.
+            theta: [rad] reading of the angle; NaN: the next reading is used.
+        """
         self.count = 0
         self._memory = sensing.NOTHING_READ
         self._duty = duty
@@ -124,25 +137,26 @@ class Observer:
 
     @property
     def voltage_bias(self) -> float:
-        """V that the motor seems to get beside what the model says."""
+        """[V] Estimated difference between the motor's voltage and the model's."""
         return self._motor.voltage
 
     @property
     def current_bias(self) -> float:
-        """A that the motor seems to draw beside what the model says."""
+        """[A] Estimated difference between the motor's current and the model's."""
         return self._motor.current
 
     def step(self, theta: float, duty: float, omega: float = math.nan, i_a: float = math.nan) -> Estimate:
-        """Take a reading, with the duty that is applied from it on.
+        """Process the readings of a sample.
 
         Args:
-            theta: [rad] angle as read; NaN where it is missing.
-            duty: 0 to 1.
-            omega: [rad/s] speed as read; used only if the observer reads the motor.
-            i_a: [A] current as read; used only if the observer reads the motor.
+            theta: [rad] reading of the angle; NaN if missing.
+            duty: [0..1] duty from this sample on.
+            omega: [rad/s] reading of the speed; NaN if missing. Used only with `motor`.
+            i_a: [A] reading of the current; NaN if missing. Used only with `motor`.
 
         Returns:
-            The estimate for the next sample, or for when a duty given then begins to act, if that is later.
+            The estimate for the time when the duty of the next sample begins to act: the next sample, or later with a
+            `command_delay`.
         """
         if self.state is None:
             self.state = self._start(theta)
@@ -160,13 +174,13 @@ class Observer:
 
     def _start(self, theta: float) -> dynamics.State:
         angle = 0.0 if math.isnan(theta) else theta
-        for _ in range(8):  # the encoder's error depends on the angle a little
+        for _ in range(8):  # fixed-point iteration: the encoder's error depends slightly on the angle
             self._memory = sensing.start(angle, 0.0, 0.0, 0.0, self._chain)
             angle += 0.0 if math.isnan(theta) else theta - self._memory.stage2
         return dynamics.steady(self.model, self._duty)._replace(theta=angle)
 
     def _voltage(self, duty: float) -> float:
-        """Voltage that acts over the hold in which this duty begins to act, but for the sag."""
+        """[V] Voltage, without sag, in the sample period in which this duty begins to act."""
         held, self._duty = np.array([self._duty, duty]), duty
         start = self.count + self._whole - 1
         return float(actuator.acting_voltage(self.numbers, held, self._effects, self.period, start, held[0])[1])
@@ -176,7 +190,7 @@ class Observer:
 def _observe(theta: float, volts: Array, s: dynamics.State, m: sensing.Memory, gain: Array,
              chain: sensing.MeasurementChain, c: dynamics.Coefficients, e: Values | None, x: dynamics.Extra | None
              ) -> tuple[dynamics.State, sensing.Memory, tuple[dynamics.State, float, float, float]]:
-    """Correct by a reading, advance over the first of the voltages, and predict over the others."""
+    """Correct the state by a reading, advance it by the first voltage, and predict it over the other voltages."""
     if not math.isnan(theta):
         error = theta - m.stage2
         y, rate = s.theta + gain[0] * error, s.theta_dot + gain[1] * error
@@ -237,14 +251,14 @@ def _correct_motor(omega: float, i_a: float, s: dynamics.State, m: MotorCorrecti
 
 @njit(nogil=True)
 def _at(angles: Array, k: float) -> float:
-    """Angle of the rotor at a sample, also between two."""
+    """[rad] Angle of the rotor at sample `k`, interpolated between samples."""
     before = math.floor(k)
     a, b = angles[int(before) % HISTORY], angles[int(before + 1.0) % HISTORY]
     return a + (k - before) * (b - a)
 
 
 def _kalman(chain: sensing.MeasurementChain, damping: float, period: float) -> Array:
-    """Gains (5,) of angle, rate, unknown torque and both stages of the angle filter, for an error of the reading."""
+    """Stationary Kalman gains (5,): angle, rate, unknown torque and both stages of the angle filter."""
     filtered = chain.filter_rate > 0.0
     a = np.zeros((5, 5))
     a[0, 1] = a[1, 2] = 1.0

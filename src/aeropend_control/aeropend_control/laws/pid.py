@@ -9,33 +9,33 @@ from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
 
 class PID:
-    """u = kp (b r - y) + ki ∫(r - y) dt - kd dy/dt, limited, by forward Euler as the thesis' library (6.4), or exact.
+    """u = kp (b r - y) + ki ∫(r - y) dt - kd dy/dt, limited; forward Euler as in the thesis' library (6.4), or exact.
 
-    Two degrees of freedom: the set-point weight b shapes the answer to a step of the reference and leaves the answer to
-    a disturbance alone. While the output is limited, the integral is led back (back-calculation, Åström & Hägglund
-    1995, 3.5).
+    Two degrees of freedom: the set-point weight b changes the response to the reference and not the response to a
+    disturbance. Anti-windup by back-calculation (Åström & Hägglund 1995, 3.5).
     """
 
     def __init__(self, kp: float, ki: float = 0.0, kd: float = 0.0, *, period: float = SAMPLE_PERIOD,
                  setpoint_weight: float = 1.0, derivative_tau: float = 0.0, tracking_time: float = 0.0,
                  low: float = -math.inf, high: float = math.inf, exact: bool = False) -> None:
-        """Gains in units of output per unit of input, per second, times second.
+        """Prepare the controller. Below, out and in are the units of output and measurement.
 
         Args:
-            kp: proportional gain.
-            ki: integral gain.
-            kd: derivative gain.
-            period: s between samples.
+            kp: [out/in] proportional gain.
+            ki: [out/in/s] integral gain.
+            kd: [out·s/in] derivative gain.
+            period: [s] between samples.
             setpoint_weight: b, 0..1.
-            derivative_tau: s of the first-order filter of the derivative; 0: none, else at least one period.
-            tracking_time: s in which the integral is led back; 0: half of sqrt(kd/ki), or kp/ki without a derivative.
-            low: least output.
-            high: greatest output.
-            exact: sample the derivative's filter and the tracking exactly for inputs held over a period, instead of by
-                forward Euler; the integral of a held error is the same by both. No time is too short for it.
+            derivative_tau: [s] time constant of the derivative's filter; 0: no filter, else at least one period.
+            tracking_time: [s] time constant of the back-calculation; 0: sqrt(kd/ki)/2, or kp/ki if kd is 0.
+            low: [out] least output.
+            high: [out] greatest output.
+            exact: discretise the derivative's filter and the back-calculation exactly for inputs held over a period,
+                instead of by forward Euler. The integral of a held error is the same in both cases. Then time constants
+                may be shorter than a period.
 
         Raises:
-            ValueError: one line that says which number cannot be used.
+            ValueError: an argument cannot be used; one line that names it.
         """
         if not 0.0 < period < math.inf:
             raise ValueError(f"period is {period} s: give more than 0")
@@ -50,10 +50,17 @@ class PID:
 
     def retune(self, kp: float, ki: float = 0.0, kd: float = 0.0, *, setpoint_weight: float = 1.0,
                tracking_time: float = 0.0) -> None:
-        """Change the gains; the integral takes over what that would change of the output.
+        """Change the gains without a bump: the integral compensates the change of the output.
+
+        Args:
+            kp: [out/in] proportional gain.
+            ki: [out/in/s] integral gain.
+            kd: [out·s/in] derivative gain.
+            setpoint_weight: b, 0..1.
+            tracking_time: [s] as for the constructor.
 
         Raises:
-            ValueError: one line that says which gain cannot be used; all are as they were.
+            ValueError: a gain cannot be used; one line that names it. All gains keep their values.
         """
         for name, value in (("kp", kp), ("ki", ki), ("kd", kd), ("setpoint_weight", setpoint_weight)):
             if not math.isfinite(value):
@@ -68,11 +75,18 @@ class PID:
         self.integral += before - self._immediate(*self._last)
 
     def align(self, output: float, reference: float, measurement: float, rate: float = 0.0) -> None:
-        """Set the integral so that the output for these goes on from `output`."""
+        """Set the integral so that the output for these inputs is `output`.
+
+        Args:
+            output: [out] the output to continue from.
+            reference: [in] reference.
+            measurement: [in] measurement.
+            rate: [in/s] derivative of the measurement.
+        """
         self.integral = output - self._immediate(reference, measurement, rate)
 
     def reset(self, integral: float = 0.0) -> None:
-        """Forget the past; `integral` is the integral's share of the output from here on."""
+        """Restart with a value of the integral part [out]."""
         self.integral = integral
         self._derivative = 0.0
         self._before = math.nan
@@ -80,33 +94,33 @@ class PID:
         self._output = 0.0
 
     def step(self, reference: float, measurement: float, rate: float | None = None) -> float:
-        """Take one sample.
+        """Process a sample.
 
         Args:
-            reference: what the measurement is to become.
-            measurement: this sample.
-            rate: its derivative, if that is known better than by the difference of two samples; not filtered.
+            reference: [in] reference.
+            measurement: [in] measurement.
+            rate: [in/s] its derivative, which is not filtered; None: the filtered difference of two samples.
 
         Returns:
-            The output, low..high.
+            [out] The output, low..high.
         """
         error = reference - measurement
         self._last = reference, measurement, self._rate(measurement) if rate is None else rate
         wanted = self.integral + self._immediate(*self._last)
         self._output = min(max(wanted, self.low), self.high)
         self.integral += self.period * self.ki * error
-        self._lead_back(self._output - wanted)
+        self._back_calculate(self._output - wanted)
         return self._output
 
     def track(self, applied: float) -> None:
-        """Tell what came of the last output further down the line, where that is limited too."""
-        self._lead_back(applied - self._output)
+        """Back-calculate from the output [out] that was applied, if it was limited further downstream."""
+        self._back_calculate(applied - self._output)
         self._output = applied
 
     def _immediate(self, reference: float, measurement: float, rate: float) -> float:
         return self.kp * (self.setpoint_weight * reference - measurement) - self.kd * rate
 
-    def _lead_back(self, excess: float) -> None:
+    def _back_calculate(self, excess: float) -> None:
         if self.ki != 0.0 and excess != 0.0:
             self.integral += self._share(self.tracking_time) * excess
 
@@ -117,7 +131,7 @@ class PID:
         return self._derivative
 
     def _share(self, tau: float) -> float:
-        """Of what a first-order lag is away from its input, the share by which it closes in over a period."""
+        """Share of its distance to a held input that a first-order lag covers in a period."""
         if tau == 0.0:
             return 1.0
         return -math.expm1(-self.period / tau) if self.exact else self.period / tau

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the laws of the arm's angle have in common: observer, PID, allocation, and compensation of dry friction."""
+"""Base of the laws of the arm's angle: observer, PID, allocation, and compensation of dry friction."""
 
 from __future__ import annotations
 
@@ -16,31 +16,37 @@ from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 from aeropend_sim.model.rig import Sample
 
 FRICTION_RATE = 0.05
-"""rad/s over which the compensation of dry friction changes its sign."""
+"""[rad/s] Width of the smooth change of sign of the friction compensation (choice)."""
 
 FRICTION_LEAD = 8.0
-"""1/s: an arm that sticks is taken to be meant to move towards the reference at this rate per rad."""
+"""[1/s] Rate per rad of control error that is added to the arm's rate for the sign of the friction compensation, so
+that a sticking arm is pushed towards the reference (choice)."""
 
 NEVER = 1e6
-"""s: a tracking time with which nothing is led back, as in the thesis' library, whose limits are the PID's own."""
+"""[s] A tracking time so long that back-calculation has no effect, as in the thesis' library (convention)."""
 
-TRACKING_TIME = Gain("s", 0.0, NEVER, 0.0, "time in which the integral is led back at a limit; 0: half of sqrt(kd/ki)")
+TRACKING_TIME = Gain("s", 0.0, NEVER, 0.0, "time constant of the anti-windup; 0: half of sqrt(kd/ki)")
 
 
 class PositionLaw:
-    """A PID on the observed angle, and an allocation of the thrust that it asks for.
+    """A PID of the observed angle, and an allocation of the demanded thrust.
 
-    A law says in `_thrust` which thrust the output of its PID means, and in `tune` what its gains are.
+    A subclass defines the thrust for an output of the PID (`_thrust`, `_per_thrust`) and the gains (`tune`).
     """
 
     parameters: ClassVar[dict[str, Gain]]
     reads_motor: ClassVar[bool] = False
 
     def __init__(self, model: Model, gains: Mapping[str, float] | None = None, period: float = SAMPLE_PERIOD) -> None:
-        """Take the model file's model; gains that are not given are those that `tune` gives for it.
+        """Prepare the law for a model.
+
+        Args:
+            model: the model of the rig.
+            gains: by name; missing ones are the defaults or come from `tune`.
+            period: [s] between samples.
 
         Raises:
-            GainError: a gain that cannot be used.
+            GainError: a gain cannot be used.
         """
         self.model = model
         given = checked(self.parameters, gains or {})
@@ -57,15 +63,15 @@ class PositionLaw:
 
     @classmethod
     def tune(cls, model: Model) -> dict[str, float]:
-        """Gains for a model."""
+        """Gains for a model, by name."""
         raise NotImplementedError
 
     def reset(self, sample: Sample | None = None, duty: float = 0.0) -> None:
-        """Forget the past; `duty` has been applied since long, and the law goes on from there without a bump.
+        """Restart the law; see `law.Law`.
 
         Args:
-            sample: a recent one, from whose angle to start; without one, that of the next.
-            duty: 0..1.
+            sample: a recent sample, whose angle is the initial angle; None: the next sample.
+            duty: [0..1] the duty that was constant for a long time.
         """
         self._observer.reset(duty, math.nan if sample is None else sample.theta)
         self._pid.reset()
@@ -73,20 +79,26 @@ class PositionLaw:
         self._bumpless = duty > 0.0
 
     def retune(self, gains: Mapping[str, float]) -> None:
-        """Take other gains, all or some, without a bump.
+        """Change some or all gains without a bump.
+
+        Args:
+            gains: new values by name.
 
         Raises:
-            GainError: a gain that cannot be used; all are as they were.
+            GainError: a gain cannot be used; all gains keep their values.
         """
         self.gains = {**self.gains, **checked(self.parameters, gains)}
         self._apply()
 
     def step(self, sample: Sample, reference: float) -> float:
-        """Take a sample and return the duty (0..1) to apply from the next sample on.
+        """Process a sample.
 
         Args:
-            sample: NaN where a reading was lost.
-            reference: rad, finite.
+            sample: the readings; NaN where a reading is missing.
+            reference: [rad] finite.
+
+        Returns:
+            [0..1] The duty to apply from the next sample on.
         """
         estimate = self._observer.step(sample.theta, self._duty, sample.omega, sample.i_a)
         s = estimate.state
@@ -101,39 +113,39 @@ class PositionLaw:
         self._duty, given = self._drive(wanted, s)
         self._missed = (given - wanted) * self._per_thrust(estimate)
         applied = u + self._missed
-        if ahead:  # what the motion ahead asks for beyond the limits is not the PID's to make good
+        if ahead:  # the PID does not make up for feedforward that the limits cut off
             applied = min(max(applied, min(u, 0.0)), max(u, 0.0))
         self._pid.track(applied)
         return self._duty
 
     def _apply(self) -> None:
-        """Put the gains to use."""
+        """Pass the gains to the parts of the law."""
         g = self.gains
         self._pid.retune(g["kp"], g["ki"], g["kd"], setpoint_weight=g["setpoint_weight"],
                          tracking_time=g["tracking_time"])
         self._allocation.thrust_time = g.get("thrust_time", 0.0)
 
     def _schedule(self, reference: float) -> None:
-        """Adapt the gains to the reference."""
+        """Adapt the gains to the reference [rad]."""
 
-    def _aim(self, reference: float, estimate: Estimate) -> tuple[float, float]:  # noqa: ARG002 - for others
-        """Where the arm is meant to be now, and what is to be added to the PID's output for that."""
+    def _aim(self, reference: float, estimate: Estimate) -> tuple[float, float]:  # noqa: ARG002 - for subclasses
+        """Reference of the PID [rad], and the feedforward that is added to its output."""
         return reference, 0.0
 
     def _thrust(self, u: float, reference: float, estimate: Estimate) -> float:
-        """Thrust (N) that an output of the PID means."""
+        """[N] Thrust for an output of the PID."""
         raise NotImplementedError
 
     def _per_thrust(self, estimate: Estimate) -> float:
-        """Change of the PID's output for a change of the thrust."""
+        """Derivative of the PID's output with respect to the thrust."""
         raise NotImplementedError
 
     def _drive(self, thrust: float, s: dynamics.State) -> tuple[float, float]:
-        """Duty for a thrust, and the thrust that comes of it."""
+        """Duty [0..1] for a thrust [N], and the thrust [N] that results within the limits."""
         return self._allocation.duty(thrust, s)
 
     def _friction(self, reference: float, s: dynamics.State) -> float:
-        """Dry friction in the pivot, rad/s², where the arm is meant to move."""
+        """[rad/s²] Dry friction in the pivot, for the direction in which the arm moves or has to move."""
         if self._arm_friction == 0.0:
             return 0.0
         towards = s.theta_dot + FRICTION_LEAD * (reference - s.theta)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The motion that a loop is to follow after a step of its reference."""
+"""Reference model: the smooth motion that a loop follows after a step of its reference."""
 
 from __future__ import annotations
 
@@ -11,14 +11,20 @@ from scipy.linalg import expm
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
 DAMPING, THIRD_POLE = 0.75, 3.0
-"""Damping ratio of its pair of poles, and how many times faster than their frequency its third one is."""
+"""Damping ratio of the pole pair, and ratio of the third pole to the frequency of the pair (choices;
+the pair has 3 % overshoot)."""
 
 
 class ReferenceModel:
-    """A third-order filter, sampled exactly: ω²p / ((s² + 2ζωs + ω²)(s + p)), so that the motion's jerk is finite."""
+    """Third-order filter ω²p / ((s² + 2ζωs + ω²)(s + p)), discretised exactly. Its jerk is finite."""
 
     def __init__(self, time: float, period: float = SAMPLE_PERIOD) -> None:
-        """Take 1/ω in s; 0: the reference itself."""
+        """Prepare the filter.
+
+        Args:
+            time: [s] 1/ω; 0: the output is the reference itself.
+            period: [s] between samples.
+        """
         self.time = time
         self._state = np.zeros(3)
         if time == 0.0:
@@ -33,11 +39,11 @@ class ReferenceModel:
         self._transition = expm(a * period)[:3]
 
     def reset(self, y: float, rate: float = 0.0, acceleration: float = 0.0) -> None:
-        """Start anew."""
+        """Restart from an angle [rad], a rate [rad/s] and an acceleration [rad/s²]."""
         self._state = np.array([y, rate, acceleration])
 
     def step(self, reference: float) -> tuple[float, float, float, float]:
-        """Take a sample of the reference; return angle, rate, acceleration and jerk of one sample later."""
+        """Process a sample of the reference [rad]; returns angle, rate, acceleration and jerk one sample later (SI)."""
         if self.time == 0.0:
             return reference, 0.0, 0.0, 0.0
         self._state = self._transition @ np.append(self._state, reference)

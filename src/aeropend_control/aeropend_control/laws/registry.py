@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of control laws: how each is made, tuned and parametrised, for nodes, commands and tests."""
+"""The table of control laws, `LAWS`: constructor, tuning and gains of each, for nodes, commands and tests."""
 
 from __future__ import annotations
 
@@ -24,12 +24,13 @@ class LawKind:
     """A kind of law.
 
     Attributes:
-        summary: one line for a person.
-        measures: what the reference is of, by the names of `Sample`: `theta` or `omega`.
-        reference_unit: its unit. reference_limits: least and greatest that makes sense.
-        parameters: its gains by name.
-        requirements: what it is tuned for if nobody says.
-        presets: complete sets of gains by name; `thesis`: the thesis' own.
+        summary: one line for the user.
+        measures: the controlled variable, a field of `Sample`: `theta` or `omega`.
+        reference_unit: unit of the reference.
+        reference_limits: least and greatest reference.
+        parameters: the gains by name.
+        presets: complete sets of gains by name; `thesis`: those of the thesis.
+        requirements: default of the requirements for tuning.
     """
 
     summary: str
@@ -43,45 +44,50 @@ class LawKind:
     requirements: Requirements = TABLE_6_1
 
     def make(self, model: Model, gains: Mapping[str, float] | None = None, **options: Any) -> Law:
-        """A law for a model.
+        """Make a law for a model.
 
         Args:
-            model: the model file's.
-            gains: by name; those that are not given are the defaults, or what `tune` gives.
-            options: `period` (s), and for `small_signal` `schedule`.
+            model: the model of the rig.
+            gains: by name; missing ones are the defaults or come from `tune`.
+            options: `period` [s], and for `small_signal` also `schedule`.
 
         Raises:
-            GainError: a gain that cannot be used.
-            TuningError: no gains can be found for this model.
+            GainError: a gain cannot be used.
+            TuningError: there are no gains for this model.
         """
         return self._make(model, gains, **options)
 
     def tune(self, model: Model, requirements: Requirements | None = None) -> dict[str, float]:
-        """Every gain, for a model and requirements on the step response, by default its own; met with a reserve.
+        """All gains, for a model and requirements on the step response, which are met with a reserve.
+
+        Args:
+            model: the model of the rig.
+            requirements: on the step response; None: the law's own.
 
         Raises:
-            TuningError: one line that says which requirement cannot be met.
+            TuningError: a requirement cannot be met; one line that names it.
         """
         defaults = {name: p.default for name, p in self.parameters.items() if p.default is not None}
         return {**defaults, **self._tune(model, requirements or self.requirements)}
 
 
 ANGLE = ("theta", "rad", (0.0, 1.2))
-"""What the laws of the angle control. More than 1.2 rad leaves no thrust to spare on `bench`."""
+"""Controlled variable, unit and limits [rad] of the laws of the angle. Above 1.2 rad the model `bench` has no thrust
+reserve."""
 
 LAWS: dict[str, LawKind] = {
-    "small_signal": LawKind("PID around an operating point, with a schedule", *ANGLE, SmallSignal.parameters,
+    "small_signal": LawKind("PID around an operating point, with gain scheduling", *ANGLE, SmallSignal.parameters,
                             SmallSignal, SmallSignal.tune, {"thesis": small_signal.THESIS_GAINS}),
-    "feedback_linearization": LawKind("PID behind feedback linearization", *ANGLE, FeedbackLinearization.parameters,
+    "feedback_linearization": LawKind("PID with feedback linearization", *ANGLE, FeedbackLinearization.parameters,
                                       FeedbackLinearization, FeedbackLinearization.tune,
                                       {"thesis": {**feedback_linearization.THESIS_GAINS, "thrust_time": 0.0}}),
-    "cascade": LawKind("speed PI over current PI, for the rotor's speed", "omega", "rad/s", (0.0, 200.0),
+    "cascade": LawKind("cascade of speed PI and current PI, for the rotor's speed", "omega", "rad/s", (0.0, 200.0),
                        Cascade.parameters, Cascade, Cascade.tune, {"thesis": cascade.THESIS_GAINS},
                        cascade.REQUIREMENTS),
     "feedback_linearization_cascade": LawKind(
-        "PID behind feedback linearization, the thrust held by the cascade", *ANGLE,
+        "PID with feedback linearization, its thrust controlled by the cascade", *ANGLE,
         FeedbackLinearizationCascade.parameters, FeedbackLinearizationCascade, FeedbackLinearizationCascade.tune,
         {"thesis": {**feedback_linearization.THESIS_GAINS, **cascade.THESIS_GAINS, "reference_time": 0.0,
                     "thrust_time": 0.0}}),
 }
-"""Every law by its name, which is also its node's."""
+"""All laws by name, which is also the name of the node."""

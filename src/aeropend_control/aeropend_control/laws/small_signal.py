@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The small-signal law (thesis 6.5): a PID for the arm made linear around an angle, its output the thrust.
+"""The small-signal law (thesis 6.5): a PID for the linearised arm, whose output is the thrust.
 
-Around y₀ the arm is H = (L/J)/(s² + (c/J)s + (mgd/J)cos y₀). One set of gains belongs to one y₀; the schedule changes
-kp with the reference so that the loop keeps the polynomial it has at `OPERATING_POINT`.
+Around y₀ the arm is H = (L/J)/(s² + (c/J)s + (mgd/J)cos y₀). A set of gains belongs to one y₀. Gain scheduling changes
+kp with the reference, so that the closed loop keeps the characteristic polynomial that it has at `OPERATING_POINT`.
 
-What the model names of effects on the arm, beside gravity and viscous friction, is taken back, so that the nominal arm
-is left to the PID; the observer and the allocation are those of the other laws (see `feedback_linearization`).
+The law compensates the effects of the model on the arm, so that the PID controls the nominal arm with its gravity and
+viscous friction. Observer and allocation are those of the other laws (see `feedback_linearization`).
 """
 
 from __future__ import annotations
@@ -30,28 +30,35 @@ from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 
 THESIS_GAINS = {"kp": 0.04, "ki": 0.993, "kd": -0.0086, "setpoint_weight": 1.0, "tracking_time": NEVER,
                 "feedforward": 0.0, "thrust_time": 0.0}
-"""The thesis' own (6.5), for 0.4 rad."""
+"""Gains of the thesis (6.5), for 0.4 rad."""
 
 REACH = 0.97
-"""Share of the settling time it is tuned for: far from where the arm was made linear the law is slower."""
+"""Share of the required settling time that is used, because far from the operating point the law is slower (choice)."""
 
 
 class SmallSignal(PositionLaw):
-    """The law, for a model; see the module. Duty 0..1 out, reference and angle in rad."""
+    """The law; see the module. Output: duty, 0..1; reference and angle in rad."""
 
     parameters: ClassVar[dict[str, Gain]] = {
-        "kp": Gain("N/rad", -10.0, 100.0, None, "proportional gain at 0.4 rad, from angle to thrust"),
+        "kp": Gain("N/rad", -10.0, 100.0, None, "proportional gain from angle to thrust at 0.4 rad"),
         "ki": Gain("N/rad/s", 0.0, 1e3, None, "integral gain"),
         "kd": Gain("N·s/rad", -1.0, 10.0, None, "derivative gain at 0.4 rad"),
         "setpoint_weight": Gain("-", 0.0, 1.0, None, "share of the reference in the proportional part"),
         "tracking_time": TRACKING_TIME,
-        "feedforward": Gain("-", 0.0, 1.0, None, "share of the thrust that holds the reference given at once"),
-        "thrust_time": Gain("s", 0.0, 1.0, None, "time in which the thrust is made to follow; 0: the motor's"),
+        "feedforward": Gain("-", 0.0, 1.0, None, "share of the steady thrust at the reference that is fed forward"),
+        "thrust_time": Gain("s", 0.0, 1.0, None, "time constant of the thrust; 0: the motor's own"),
     }
 
     def __init__(self, model: Model, gains: Mapping[str, float] | None = None, period: float = SAMPLE_PERIOD,
                  schedule: bool = True) -> None:
-        """As `PositionLaw`; without `schedule` the gains are those of 0.4 rad everywhere, as in the thesis."""
+        """Prepare the law.
+
+        Args:
+            model: see `PositionLaw`.
+            gains: see `PositionLaw`.
+            period: [s] between samples.
+            schedule: gain scheduling; False: the gains for 0.4 rad at every angle, as in the thesis.
+        """
         self.schedule = schedule
         super().__init__(model, gains, period)
 
@@ -59,14 +66,18 @@ class SmallSignal(PositionLaw):
     def tune(cls, model: Model, requirements: Requirements = TABLE_6_1) -> dict[str, float]:
         """Gains that meet requirements with a reserve.
 
+        Args:
+            model: the model of the rig.
+            requirements: on the step response.
+
         Raises:
-            TuningError: one line that says which requirement cannot be met.
+            TuningError: a requirement cannot be met; one line that names it.
         """
         M_p = OVERSHOOT_SHARE * requirements.M_p
         kp, ki, kd, weight, thrust_time = place(model, REACH * settling_time(requirements, M_p), M_p)
         n = model.numbers()
         stiffness, per = arm_stiffness(model, OPERATING_POINT), 1.0 / n["L_over_J"]
-        # with gravity left to the PID kp loses what gravity gives; the reference acts through the feedforward alone
+        # gravity is not compensated: its stiffness counts for kp. The reference acts through the feedforward only.
         return {"kp": per * (kp - stiffness), "ki": per * ki, "kd": per * kd, "setpoint_weight": 0.0,
                 "feedforward": min(1.0, weight * kp / stiffness), "thrust_time": thrust_time}
 

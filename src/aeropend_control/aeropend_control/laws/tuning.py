@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gains from requirements and a model, by pole placement."""
+"""Tuning by pole placement: gains from a model and requirements on the step response."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from aeropend_sim.model import actuator
 from aeropend_sim.model.parameters import Model
 
 OTHER_POLES = 3.0
-"""How many times faster than the dominant pair the other two poles of a tuned loop decay."""
+"""Ratio of the decay of the other two poles of a tuned loop to that of the dominant pair (choice; 3 to 5 is usual)."""
 
 SHORTEST_LAG, LONGEST_LAG = 0.02, 0.15
-"""s in which the thrust of a tuned loop follows."""
+"""[s] Limits of the time constant of the thrust in a tuned loop (choice)."""
 
 OPERATING_POINT = 0.4
-"""rad around which the thesis makes the arm linear."""
+"""[rad] Angle around which the thesis linearises the arm (6.5)."""
 
 TIME_SHARE, OVERSHOOT_SHARE = 0.7, 0.5
-"""How much of what is required a loop is tuned to use."""
+"""Shares of the required times and of the required overshoot that a tuned loop uses; the rest is reserve (choice)."""
 
 
 class TuningError(ValueError):
-    """Requirements that the model cannot meet; the message is one line for a person."""
+    """The model cannot meet the requirements; the message is one line for the user."""
 
 
 class Requirements(NamedTuple):
-    """What a step response may take at most: rise, peak and settling time (s), overshoot (share)."""
+    """Limits of a step response: rise, peak and settling time [s], overshoot [share]."""
 
     t_r: float = 0.5
     t_p: float = 0.9
@@ -40,14 +40,14 @@ TABLE_6_1 = Requirements()
 
 
 class Pair(NamedTuple):
-    """A dominant pair of poles: s² + 2 decay s + omega_2."""
+    """A dominant pair of poles: s² + 2 decay s + omega_2; [1/s], [1/s²]."""
 
     decay: float
     omega_2: float
 
 
 class Placed(NamedTuple):
-    """A PID with output in rad/s² that places the poles of the arm (1/s², 1/s³, 1/s), see `place`."""
+    """Gains of a PID with output in rad/s² (kp [1/s²], ki [1/s³], kd [1/s]), set-point weight, and thrust time [s]."""
 
     kp: float
     ki: float
@@ -57,10 +57,14 @@ class Placed(NamedTuple):
 
 
 def pair(t_s: float, M_p: float) -> Pair:
-    """The pair that settles to 2 % in t_s (s) with an overshoot M_p.
+    """The pair of poles for a settling time and an overshoot.
+
+    Args:
+        t_s: [s] settling time to 2 %.
+        M_p: overshoot as a share, 0 < M_p < 1.
 
     Raises:
-        TuningError: no such pair.
+        TuningError: an argument is out of range.
     """
     if not 0.0 < M_p < 1.0:
         raise TuningError(f"overshoot {M_p:g}: give a share above 0 and below 1")
@@ -76,10 +80,14 @@ def _damping(M_p: float) -> float:
 
 
 def settling_time(r: Requirements, M_p: float) -> float:
-    """Settling time (s) of the slowest pair of overshoot M_p with which every time keeps `TIME_SHARE` of its limit.
+    """[s] Settling time of the slowest pair of poles whose times are within `TIME_SHARE` of their limits.
+
+    Args:
+        r: the limits.
+        M_p: overshoot of the pair as a share, 0 < M_p < 1.
 
     Raises:
-        TuningError: a time that is not positive, or an overshoot out of range.
+        TuningError: a time is not positive, or the overshoot is out of range.
     """
     for name, value in r._asdict().items():
         if not 0.0 < value < math.inf:
@@ -96,21 +104,22 @@ def settling_time(r: Requirements, M_p: float) -> float:
 
 def place(model: Model, t_s: float, M_p: float, at: float = OPERATING_POINT, other_poles: float = OTHER_POLES
           ) -> Placed:
-    """A PID for the arm with its gravity taken back, linear around an angle, by pole placement.
+    """A PID for the linearised arm with compensated gravity, by pole placement.
 
-    A thrust that follows in T leaves the loop with T s⁴ + (1 + c/J T) s³ + (c/J + mgd/J cos y T + kd) s² + kp s + ki:
-    a dominant pair from the requirements, and two real poles `other_poles` times faster, one of them cancelled by the
-    set-point weight.
+    With the thrust's time constant T the characteristic polynomial of the loop is
+    T s⁴ + (1 + c/J T) s³ + (c/J + mgd/J cos y T + kd) s² + kp s + ki. Its roots are a dominant pair, from the
+    requirements, and two real poles that decay `other_poles` times faster. The zero of the set-point weight cancels one
+    of these.
 
     Args:
-        model: the model file's.
-        t_s: settling time to 2 %, s.
-        M_p: overshoot, 0 < M_p < 1.
-        at: angle, rad.
-        other_poles: how many times faster than the pair the others decay.
+        model: the model of the rig.
+        t_s: [s] settling time to 2 %.
+        M_p: overshoot as a share, 0 < M_p < 1.
+        at: [rad] angle around which the arm is linearised.
+        other_poles: ratio of the decay of the other poles to that of the pair.
 
     Raises:
-        TuningError: one line that says which requirement cannot be met.
+        TuningError: a requirement cannot be met; one line that names it.
     """
     decay, omega_2 = pair(t_s, M_p)
     n = model.numbers()
@@ -143,7 +152,12 @@ def arm_stiffness(model: Model, at: float) -> float:
 
 
 def thrust_lag(model: Model, at: float) -> float:
-    """In how many s the thrust follows the voltage that holds it, around an angle: winding, rotor and air."""
+    """[s] Time constant from the steady voltage to the thrust: winding, rotor and air.
+
+    Args:
+        model: the model of the rig.
+        at: [rad] angle of the operating point.
+    """
     n = model.numbers()
     speed = float(actuator.speed(n, n["mgd_over_J"] / n["L_over_J"] * math.sin(at)))
     friction = n["B_m"] + 2.0 * n["k_load"] * speed
