@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+
+import numpy as np
+import pytest
+from sparse_data import simulated
+
+from aeropend_ident.bags.recording import RecordingError
+from aeropend_ident.identification.dataset import from_arrays
+from aeropend_sim.model.parameters import SAMPLE_PERIOD
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    ({"omega": np.nan}, "omega is not a number"),
+    ({"i_a": 0.5}, "i_a is 0.5 all the time"),
+])
+def test_bad_arrays_are_refused_in_one_line(change, words):
+    x, v = simulated(6.0)
+    for name, value in change.items():
+        x[name] = np.full(len(v), value)
+    with pytest.raises(RecordingError, match=words) as error:
+        from_arrays(x, {"v_a": v}, SAMPLE_PERIOD)
+    assert "\n" not in str(error.value)

@@ -1,0 +1,9 @@
+# SPDX-License-Identifier: Apache-2.0
+
+from aeropend_ident.studies import lorenz
+
+
+def test_lorenz_is_found_by_every_method():
+    for method in ("sindy", "weak", "discrepancy-sindy", "discrepancy-weak"):
+        found = lorenz.study(method, 0.05, 4)
+        assert lorenz.is_exact(found.equations, lorenz.truth(method)), method
