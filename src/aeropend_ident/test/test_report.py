@@ -216,14 +216,14 @@ def test_unknown(friction):
     rows = [{**r, "found": False} for r in friction.body["which"]["candidates"]]
     page = Page(rendered(friction, verdict="unknown", effects=[], candidates=rows,
                          unexplained=["theta is off by 9.1 times the noise"]))
-    assert page.text("h1") == ("The model lacks something that the catalogue does not hold, "
-                               "in this part of the chain: arm.")
+    assert page.text("h1") == "The model lacks an effect that the catalogue does not contain, at this place: arm."
     assert "theta is off by 9.1 times the noise" in page.text("header")
     assert page.text("title") == "unknown effect · diagnose"
 
 
 @pytest.mark.parametrize(("reasons", "said"), [
-    ([], "the catalogue does not explain."), (["theta is off", "omega is"], "not explain: theta is off; omega is.")])
+    ([], "(arm). No effect of the catalogue explains the misfit."),
+    (["theta is off", "omega is"], "explains the misfit: theta is off; omega is.")])
 def test_reasons_for_an_unknown_are_said_where_there_are_any(friction, reasons, said):
     made = documented(friction, verdict="unknown", effects=[], unexplained=reasons)
     assert verdict_lines(made)[0].endswith(said)
@@ -233,7 +233,7 @@ def test_what_an_unknown_looks_like(strange):
     unknown = strange.body["which"]["unknown"]
     assert (strange.body["which"]["verdict"], unknown["place"]) == ("unknown", "arm")
     page = Page(rendered(strange))
-    assert page.text("h1").endswith("in this part of the chain: arm.")
+    assert page.text("h1").endswith("at this place: arm.")
     assert "#unknown" in [a["href"] for a in page.all("a")]
     drawn = [a for a in page.all("path") if a.get("class") == "knots"]
     assert len(drawn) == len(unknown["curves"])
@@ -251,7 +251,7 @@ def test_an_unknown_beside_what_was_found(friction, strange):
     unknown = {**strange.body["which"]["unknown"], "place": "rotor"}
     page = Page(rendered(friction, unknown=unknown))
     assert page.text("h1").startswith("The model lacks coulomb_friction")
-    assert "remains in this part of the chain: rotor." in page.text("header")
+    assert "does not contain acts at this place: rotor." in page.text("header")
     assert "unknown" in page.ids
     assert "unknown" not in Page(rendered(friction)).ids
 
@@ -275,8 +275,10 @@ def test_curves_are_drawn_without_what_a_number_does():
     assert [c.variable.phrase for c in drawn] == ["the arm rate", "the arm angle"]
     first, second = (plain(c.text) for c in drawn)
     assert first == ("Peaks at 0 rad/s² near 0 rad/s, from −2.0 rad/s² at −2.0 rad/s to −2.0 rad/s² at 2.0 rad/s; "
-                     "besides, a slope by −8.0 rad/s² in all, which the model's numbers may do as well.")
-    assert second == "Next to nothing; besides, a slope by 20 rad/s² in all, which the model's numbers may do as well."
+                     "in addition a straight line, −8.0 rad/s² from end to end, that parameters of the model can "
+                     "describe.")
+    assert second == ("Almost zero; in addition a straight line, 20 rad/s² from end to end, that parameters of the "
+                      "model can describe.")
     heights = [float(p.split()[1]) for p in drawn[1].curve[1:].split("L")]
     assert max(heights) - min(heights) <= 1.0
 
@@ -329,25 +331,25 @@ def test_reasons_for_care(friction, angle_only):
         page = Page(rendered(diagnosis, **which))
         return page.text("header", "div")
 
-    assert "Only 11 s were fitted" in care(friction)
+    assert "Only 11 s of data were fitted" in care(friction)
     assert "Not measured: rotor speed, armature current, armature voltage." in care(angle_only)
     both = ["coulomb_friction", next(r["effect"] for r in friction.body["which"]["candidates"]
                                      if r["effect"] not in {"coulomb_friction", "parameter_mismatch"})]
     rows = [{**r, "found": r["effect"] in both, "probability": min(r["probability"], 0.8), "place": "arm"}
             for r in friction.body["which"]["candidates"]]
     unsure = care(friction, candidates=rows, effects=both)
-    assert f"Less sure than 95 %: {', '.join(both)}." in unsure
-    assert f"In the same part of the chain: {', '.join(both)}." in unsure
+    assert f"Probability below 95 %: {', '.join(both)}." in unsure
+    assert f"No signal is measured between these: {', '.join(both)}." in unsure
     numbers = friction.body["which"]["numbers"]
     moved = {**numbers, "R_a": {"nominal": 1.0, "value": 1.2, "low": 1.1, "high": 1.3}}
-    assert "without being claimed: R_a. Check in the model file." in care(friction, numbers=moved)
+    assert "not part of the verdict: R_a. Check them in the model file." in care(friction, numbers=moved)
     still = replace(friction.signals[0], duty=np.full(len(friction.signals[0]), 0.3))
-    assert "The duty varied by 0.0 only" in care(replace(friction, signals=[still]))
+    assert "The duty varied by only 0.0" in care(replace(friction, signals=[still]))
     noted = replace(friction.signals[0], notes=("not measured: v_a", "2 samples are missing in 1 gap"))
-    assert "1 note tells" in care(replace(friction, signals=[noted]))
+    assert "1 note describes" in care(replace(friction, signals=[noted]))
     assert "note" not in care(friction)
     open_ = {**friction.body["shrink"], "closed": 0.6}
-    assert "No more than 60 % of the gap closes" in care(replace(friction, body={**friction.body, "shrink": open_}))
+    assert "Only 60 % of the gap closes" in care(replace(friction, body={**friction.body, "shrink": open_}))
 
 
 def test_a_good_recording_needs_no_care(friction):
@@ -378,10 +380,10 @@ def test_effects_and_a_number_together(friction):
 def test_what_is_open(friction):
     advice = {"why": "slow ramps tell them apart", "excite": {"kind": "steps", "duration": 60, "sequence": [0.1, 0.2]}}
     page = Page(rendered(friction, not_separable=[["coulomb_friction", "quadratic_drag"]], next_experiment=advice))
-    assert "This recording cannot tell coulomb_friction from quadratic_drag." in page.text("main")
+    assert "This recording cannot separate coulomb_friction from quadratic_drag." in page.text("main")
     assert "slow ramps tell them apart" in page.text("main")
     assert page.text("main", "pre") == "excite --ros-args -p kind:=steps -p duration:=60 -p 'sequence:=[0.1, 0.2]'"
-    assert "cannot tell" not in Page(rendered(friction, not_separable=[], next_experiment=None)).text("main")
+    assert "cannot separate" not in Page(rendered(friction, not_separable=[], next_experiment=None)).text("main")
 
 
 def test_a_number_that_moved_is_marked(friction):
@@ -398,7 +400,7 @@ def test_a_number_that_moved_is_marked(friction):
 
 def test_missing_channels_are_said(angle_only):
     page = Page(rendered(angle_only))
-    assert "nothing is known of it: rotor speed, armature current, armature voltage." in page.text("main")
+    assert "Not measured: rotor speed, armature current, armature voltage." in page.text("main")
     assert len(page.data()[0]["series"]) == 1 + 3 + 2
 
 
@@ -439,7 +441,7 @@ def test_a_long_recording_stays_small(friction):
     far = [{c: x + rng.standard_normal(n) for c, x in noise.items()}] * 5
     text = rendered(replace(friction, signals=[long] * 5, before=far, after=far), list("abcde"))
     assert len(text.encode()) < 1_500_000
-    assert "Shown are the 4 recordings with the widest gap." in Page(text).text("main")
+    assert "The 4 recordings with the largest gap are shown." in Page(text).text("main")
 
 
 @pytest.mark.parametrize(("value", "unit", "text"), [

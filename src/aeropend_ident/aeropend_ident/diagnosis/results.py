@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a diagnosis hands out: `diagnosis.json`, `report.html`, `augmented.yaml`, and the verdict in a few lines."""
+"""The results of a diagnosis: `diagnosis.json`, `report.html`, `augmented.yaml`, and the verdict in a few lines."""
 
 from __future__ import annotations
 
@@ -109,26 +109,25 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
     which, closure = document.which, document.closure
     lines = []
     if which.verdict == "none":
-        lines.append("verdict: none. The model explains the recording once its numbers are refitted.")
+        lines.append("verdict: none. With refitted parameters the model explains the recording.")
     elif which.verdict == "unknown":
         why = f": {'; '.join(which.unexplained)}" if which.unexplained else ""
-        lines.append(f"verdict: unknown. Something in the {document.where.place} that the catalogue does not "
-                     f"explain{why}.")
+        lines.append(f"verdict: unknown ({document.where.place}). No effect of the catalogue explains the misfit{why}.")
     else:
         lines.append(f"verdict: {' and '.join(which.effects)} ({document.where.place})")
     found = {c.effect: c for c in reversed(which.candidates)}
     lines += [f"  {effect}: {describe(found[effect])}" for effect in which.effects]
-    lines += [f"  not separable from this recording: {' and '.join(pair)}" for pair in which.not_separable]
+    lines += [f"  not separable by this recording: {' and '.join(pair)}" for pair in which.not_separable]
     if which.next_experiment:
         lines.append(f"  next: {experiment(which.next_experiment)}")
     if document.identified is not None:
-        lines.append(f"  {numbers(document.identified, which.numbers)}")
+        lines.append(f"  {identified_line(document.identified, which.numbers)}")
     lines.append(gap_line("gap on held-out data", closure))
     lines += [gap_line(f"gap on {across.bag}, not fitted to", across) for across in closure.across]
     return lines
 
 
-def numbers(identified: Identified, rows: Mapping[str, ParameterRow]) -> str:
+def identified_line(identified: Identified, rows: Mapping[str, ParameterRow]) -> str:
     """The parameters of an uncalibrated rig in one line, and those that are not determined.
 
     Args:
@@ -143,7 +142,7 @@ def numbers(identified: Identified, rows: Mapping[str, ParameterRow]) -> str:
                      + (f" (run to run {hangs.run_to_run:.2g})" if hangs.run_to_run else ""))
     if lift := identified.lift:
         texts.append(f"lift up to {lift.rad_per_s2[-1]:.3g} rad/s² at a duty of {lift.duty[-1]:.2f}, none below "
-                     f"{lift.dead_zone:.2g}, behind a lag of {lift.lag_s:.2g} s")
+                     f"{lift.dead_zone:.2g}, with a lag of {lift.lag_s:.2g} s")
     left = ", ".join(identified.not_determined)
     return (f"identified from {identified.basis}: {', '.join(texts) or 'nothing'}"
             + (f"; not determined: {left}" if left else ""))
@@ -162,8 +161,13 @@ def gap_line(name: str, closed: ClosedGap) -> str:
         return f"{line}: nothing to close"
     interval = ""
     if closed.low is not None and closed.high is not None:
-        interval = f" ({100 * closed.low:.0f} to {100 * closed.high:.0f} %)"
-    return f"{line}: {100 * closed.closed:.0f} %{interval} of what can close"
+        interval = f" ({_percent(closed.low)} to {_percent(closed.high)} %)"
+    return f"{line}: {_percent(closed.closed)} %{interval} of the gap above the floor is closed"
+
+
+def _percent(share: float) -> int:
+    """A share in whole percent."""
+    return round(100.0 * share)
 
 
 def experiment(advice: NextExperiment) -> str:

@@ -32,7 +32,7 @@ CALM = {"duty": 0.25, "theta": 0.2}
 """[1, rad] Range of a signal below which most effects hardly show (choice)."""
 
 SURE = 0.95
-"""Probability below which an effect is called less than sure (convention: 95 %)."""
+"""Probability below which an effect is listed as less than sure (convention: 95 %)."""
 
 
 def reasons(document: DiagnosisDocument, recordings: Sequence[Signals], candidates: Sequence[CandidateRow],
@@ -53,35 +53,35 @@ def _data(document: DiagnosisDocument, recordings: Sequence[Signals]) -> Iterato
     """Reasons in the data."""
     missing = gap.missing(document)
     if missing:
-        yield f"Not measured: {', '.join(missing)}. What shows there alone can be neither seen nor told apart."
+        yield f"Not measured: {', '.join(missing)}. Effects that show only there cannot be found."
     notes = sum(not n.startswith("not measured") for s in recordings for n in s.notes)
     if notes:
-        yield f"{notes} {'note tells' if notes == 1 else 'notes tell'} what is odd in the data; see the end."
+        yield f"{notes} {'note describes' if notes == 1 else 'notes describe'} unusual data: see the end of the page."
     fitted = sum(s.train * s.period for s in recordings)
     if fitted < SHORT:
-        yield f"Only {quantity(fitted, 's', 2)} were fitted: {quantity(SHORT, 's', 2)} or more say more."
+        yield (f"Only {quantity(fitted, 's', 2)} of data were fitted; {quantity(SHORT, 's', 2)} or more give a surer "
+               "verdict.")
     driven = any(s.driven for s in recordings)
     for name, least in CALM.items():
         spread = max(_range(s.channel(name)) for s in recordings)
         if spread < least and (driven or name != "duty"):
             v = VARIABLES[name]
-            yield f"The {v.name} varied by {quantity(spread, v.unit, 2)} only: most effects hardly show in that."
+            yield f"The {v.name} varied by only {quantity(spread, v.unit, 2)}: most effects hardly show in this range."
 
 
 def _effects(document: DiagnosisDocument, found: Sequence[CandidateRow]) -> Iterator[str]:
     """Reasons in the effects found."""
     closed = document.closure.closed
     if found and closed is not None and closed < CLOSED and not RANDOM & {c.effect for c in found}:
-        yield (f"No more than {percent(closed)} of the gap closes: there is more to it, or it has another form "
-               "than the catalogue's.")
+        yield (f"Only {percent(closed)} of the gap closes: a further effect acts, or the effect has another form than "
+               "in the catalogue.")
     unsure = [c.name for c in found if c.probability < SURE]
     if unsure:
-        yield f"Less sure than 95 %: {', '.join(unsure)}."
+        yield f"Probability below 95 %: {', '.join(unsure)}."
     for places in NOT_SEPARATED:
         together = [c.name for c in found if c.place in places]
         if len(together) > 1:
-            yield (f"In the same part of the chain: {', '.join(together)}. A share of one can pass as one of "
-                   "another.")
+            yield f"No signal is measured between these: {', '.join(together)}. Part of one can pass for another."
 
 
 def _shifts(document: DiagnosisDocument, found: Sequence[CandidateRow], parameters: Sequence[ParameterRowText]
@@ -90,8 +90,11 @@ def _shifts(document: DiagnosisDocument, found: Sequence[CandidateRow], paramete
     claimed = {c.parameter for c in found}
     moved = [p.name for p in parameters if p.name not in claimed and (p.low > OFF or p.high < -OFF)]
     if moved and document.identified is None:
-        advice = "Part of what is not known may hide there." if document.which.unknown else "Check in the model file."
-        yield f"Surely off by more than {100.0 * OFF:g} %, without being claimed: {', '.join(moved)}. {advice}"
+        advice = "Check them in the model file."
+        if document.which.unknown:
+            advice = "Part of the unknown effect may appear as their shift."
+        yield (f"These parameters are off by more than {100.0 * OFF:g} % but not part of the verdict: "
+               f"{', '.join(moved)}. {advice}")
 
 
 def _range(x: Array) -> float:

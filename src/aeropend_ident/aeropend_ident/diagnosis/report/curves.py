@@ -24,7 +24,7 @@ TERMS = {
     ("electrical", "Ω"): "voltage in the winding per ampere", ("rotor", "N·m"): "torque on the rotor",
     ("thrust", "rad/s²"): "force of the air, as acceleration of the arm", ("thrust", "-"): "share of the thrust",
     ("arm", "rad/s²"): "torque on the arm, as acceleration", ("arm", "1/s"): "torque on the arm, per arm rate",
-    ("sensing", "rad"): "error of the angle read", ("sensing", "A"): "error of the current read",
+    ("sensing", "rad"): "error of the angle reading", ("sensing", "A"): "error of the current reading",
 }
 """What is missing, by place and unit; positive where it drives or lifts."""
 
@@ -32,7 +32,7 @@ LATE = re.compile(r"step of the duty, (\d+) samples? ago")
 """Variable of a curve that belongs to a single step of the duty."""
 
 NOTHING = 0.1
-"""Share of the effect of the strongest curve below which another one is called next to nothing (choice)."""
+"""Share of the effect of the strongest curve below which another one is called almost zero (choice)."""
 
 JUMP = 0.55
 """Share of a curve's height between two neighbouring knots from which the text mentions them (choice)."""
@@ -222,10 +222,10 @@ def _picture(c: _Curve, place: str, span: float, most: float) -> CurvePicture:
     points = [f"{WIDTH * (a - left) / (right - left):.0f} {HEIGHT * (high - b) / (high - low):.0f}"
               for a, b in zip(c.x, c.y, strict=True)]
     scale, unit = _scale(max(-low, high), c.unit)
-    text = "next to nothing" if c.amount < NOTHING * most else _shape(c.x, scale * c.y, v.unit, unit)
+    text = "almost zero" if c.amount < NOTHING * most else _shape(c.x, scale * c.y, v.unit, unit)
     if c.slant > NOTHING * most:
         rise = quantity(scale * float(c.line[-1] - c.line[0]), unit, 2)
-        text += f"; besides, a slope by {rise} in all, which the model's numbers may do as well"
+        text += f"; in addition a straight line, {rise} from end to end, that parameters of the model can describe"
     marks = from_top(ticks(scale * low, scale * high, 5))
     return CurvePicture(v, term, unit, f"{text[:1].upper()}{text[1:]}.",
                         f"{term} against {v.phrase}, a curve with {len(c.x)} knots: {text}", "M" + "L".join(points),

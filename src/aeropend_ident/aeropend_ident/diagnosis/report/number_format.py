@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers as a person reads them: digits that count, units, intervals, shares, and ticks along an axis."""
+"""Numbers as texts: significant digits, units, intervals, shares, and ticks of an axis."""
 
 from __future__ import annotations
 
@@ -11,7 +11,13 @@ from aeropend_sim.cli.axis import multiples, tick_step
 
 
 def quantity(value: float | None, unit: str = "", digits: int = 3) -> str:
-    """A number to some significant digits with its unit: `0.0320 rad`, `1.78 × 10⁻⁵ kg·m²`, or a dash for none."""
+    """A number with its unit: `0.0320 rad`, `1.78 × 10⁻⁵ kg·m²`.
+
+    Args:
+        value: the number; None or no finite number gives a dash.
+        unit: its unit; "" or "-" for none.
+        digits: significant digits.
+    """
     if value is None or not math.isfinite(value):
         return "–"
     exponent = _exponent(value)
@@ -20,7 +26,7 @@ def quantity(value: float | None, unit: str = "", digits: int = 3) -> str:
 
 
 def exact(value: float) -> str:
-    """A number as it was given, to six digits: `43629`, `6.8 × 10⁻⁴`."""
+    """A number as it was given, to at most six digits: `43629`, `6.8 × 10⁻⁴`."""
     if not math.isfinite(value):
         return "–"
     exponent = _exponent(value)
@@ -28,7 +34,16 @@ def exact(value: float) -> str:
 
 
 def interval(value: float, low: float, high: float) -> tuple[str, str]:
-    """A value and its interval to the digits that the interval leaves certain: `0.799`, `0.798 to 0.801`."""
+    """A value and its interval, to two digits of half of the width: `0.7994`, `0.7981 to 0.8006`.
+
+    Args:
+        value: the estimate.
+        low: lower end of the interval.
+        high: upper end of the interval.
+
+    Returns:
+        The value and the interval, as texts.
+    """
     if not all(map(math.isfinite, (value, low, high))):
         return quantity(value), f"{quantity(low)} to {quantity(high)}"
     exponent = _exponent(max((value, low, high), key=abs))
@@ -40,7 +55,12 @@ def interval(value: float, low: float, high: float) -> tuple[str, str]:
 
 
 def percent(share: float | None, sign: bool = False) -> str:
-    """A share (0..1) in percent; never rounded to 0 or 100 from outside, unless it is a change (`sign`)."""
+    """A share in percent.
+
+    Args:
+        share: [0..1] the share. One between 0 and 1 is never rounded to 0 or 100.
+        sign: whether it is a change: it has a sign and is rounded in any case.
+    """
     if share is None or not math.isfinite(share):
         return "–"
     x = 100.0 * share
@@ -59,7 +79,7 @@ def percent(share: float | None, sign: bool = False) -> str:
 
 
 def probability(p: float) -> str:
-    """A probability in percent; never certain."""
+    """A probability (0 to 1) in percent; never 0 or 100."""
     return percent(min(max(p, 1e-6), 1.0 - 1e-6))
 
 
@@ -73,7 +93,13 @@ def _exponent(x: float) -> int:
 
 
 def fixed(x: float, exponent: int, decimals: int) -> str:
-    """A number over a power of ten, with so many decimals: `fixed(-1234.5, 3, 2)` is `−1.23`."""
+    """A number with a fixed number of decimals: `fixed(-1234.5, 3, 2)` is `−1.23`.
+
+    Args:
+        x: the number.
+        exponent: power of ten that it is divided by.
+        decimals: number of decimals.
+    """
     return f"{round(x / 10.0**exponent, decimals) + 0.0:.{max(decimals, 0)}f}".replace("-", "−")
 
 
@@ -83,7 +109,12 @@ def _power(exponent: int) -> str:
 
 
 def with_unit(text: str, unit: str) -> str:
-    """A number and its unit, never torn apart at the end of a line; `-` is no unit."""
+    """A number and its unit with a space that does not break a line.
+
+    Args:
+        text: the number.
+        unit: its unit; "" or "-" for none.
+    """
     return f"{text}\N{NO-BREAK SPACE}{unit}" if unit not in ("", "-") else text
 
 
@@ -93,7 +124,12 @@ def minus(formula: str) -> str:
 
 
 def ends(low: float, high: float) -> list[str]:
-    """The ends of a range to two digits of its width."""
+    """The ends of a range, to two digits of its width.
+
+    Args:
+        low: lower end.
+        high: upper end.
+    """
     decimals = 1 - _magnitude(high - low)
     return [fixed(x, 0, decimals) for x in (low, high)]
 

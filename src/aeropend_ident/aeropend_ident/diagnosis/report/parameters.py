@@ -111,8 +111,8 @@ def _identified(document: DiagnosisDocument) -> IdentifiedText | None:
               for name, n in document.which.numbers.items() if n.run_to_run]
     hangs, lift = identified.hangs_at, identified.lift
     if hangs and hangs.run_to_run:
-        spread.append(f"where the arm hangs by {quantity(hangs.run_to_run, 'rad', 2)}")
+        spread.append(f"the angle where the arm hangs by {quantity(hangs.run_to_run, 'rad', 2)}")
     curve = (f"up to {quantity(lift.rad_per_s2[-1], 'rad/s²')} at a duty of {lift.duty[-1]:.2f}, none below "
-             f"{lift.dead_zone:.2f}, behind a lag of {quantity(lift.lag_s, 's', 2)}" if lift else "")
+             f"{lift.dead_zone:.2f}, with a lag of {quantity(lift.lag_s, 's', 2)}" if lift else "")
     return IdentifiedText(identified.basis, identified.not_determined, ", ".join(spread),
                           quantity(hangs.value, "rad", 2) if hangs else "", curve)

@@ -98,8 +98,7 @@ def _sentence(document: DiagnosisDocument, found: Sequence[CandidateRow]) -> lis
     if verdict == "none":
         return [Part("The model lacks nothing that this recording shows.")]
     if verdict == "unknown":
-        return [Part("The model lacks something that the catalogue does not hold, in this part of the chain: "),
-                Part(f"{place}.")]
+        return [Part(f"The model lacks an effect that the catalogue does not contain, at this place: {place}.")]
     if not effects:
         meanings = dict.fromkeys(PARAMETERS[f"model.{name}"].description.partition(":")[0] for name in parameters)
         return [Part("The structure of the model is right, but "), *_listed(parameters),
@@ -113,34 +112,27 @@ def _sentence(document: DiagnosisDocument, found: Sequence[CandidateRow]) -> lis
 
 def _consequence(document: DiagnosisDocument, found: Sequence[CandidateRow]) -> str:
     """How far the gap closes."""
-    which, share = document.which, document.closure.closed
-    judged = _judged(document)
+    which, share, (start, stop) = document.which, document.closure.closed, document.held_out_s
+    if share is None:
+        return "There is nothing to close: the gap is within the noise of the readings."
     it = "it" if len(found) == 1 else "them"
     if which.verdict == "none":
-        text = f"Refitting its numbers {judged}."
+        action = "Refitting its parameters"
     elif which.verdict == "unknown":
-        text = f"Everything that is known, refitted and added, {judged}."
+        action = "Refitting the parameters and adding the effects found" if found else "Refitting the parameters"
     elif all(c.parameter for c in found):
-        text = f"Correcting {it}, with the other numbers refitted, {judged}."
+        action = f"Correcting {it} and refitting the other parameters"
     else:
-        text = f"Adding {it}, with the numbers refitted, {judged}."
-    if share is not None and share < MOSTLY_OPEN and RANDOM & set(which.effects) and which.verdict != "unknown":
-        text += " What is random in it can be named and sized, but not predicted: that part of the gap stays open."
-    return text
-
-
-def _judged(document: DiagnosisDocument) -> str:
-    """The predicate of that sentence."""
-    share, (start, stop) = document.closure.closed, document.held_out_s
-    if share is None:
-        return "has nothing to close: the gap is within the noise of the readings"
+        action = f"Adding {it} and refitting the parameters"
     held = f"the last {quantity(stop - start, 's', 2)} of the recording"
     if len(document.bags) > 1:
         held = "the last part of each recording"
     between = _between(document)
     interval = f" ({percent(0.95)} interval {between})" if between else ""
-    closes = percent(share) if share > 0.0 else "none"
-    return f"closes {closes} of the gap{interval} on {held}, to which nothing was fitted"
+    text = f"{action} closes {percent(share) if share > 0.0 else 'none'} of the gap{interval} on held-out data, {held}."
+    if share < MOSTLY_OPEN and RANDOM & set(which.effects) and which.verdict != "unknown":
+        text += " Random effects can be measured but not predicted, so their part of the gap stays open."
+    return text
 
 
 def _between(document: DiagnosisDocument) -> str:
