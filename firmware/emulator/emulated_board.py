@@ -26,7 +26,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
 
-import yaml
 from board import (
     ANGLE_ZERO,
     BROWN_OUT,
@@ -43,7 +42,7 @@ from board import (
 
 from aeropend_sim.cli.command import Parser
 from aeropend_sim.model.effects import CATALOGUE
-from aeropend_sim.model.parameters import PRESETS, Model, ModelError, _Loader, _node_parameters, from_flat, load
+from aeropend_sim.model.parameters import PRESETS, Model, ModelError, from_flat, load, read_flat
 from aeropend_sim.ros.realtime import monotonic_to_ros_ns, prepare_thread, request_realtime_priority
 
 PERIOD_NS = PERIOD_CYCLES * 1_000_000_000 // CLOCK_HZ
@@ -340,13 +339,7 @@ def _numbers(effects: Sequence[str], others: Sequence[str]) -> dict[str, float]:
 
 def _model(source: str, preset: str) -> Model:
     """Read a model like the plant node: a preset, or a file whose missing parameters come from a preset."""
-    try:
-        return load(source)
-    except ModelError as error:
-        if " is missing (" not in str(error) and " has no parameter" not in str(error):
-            raise
-    text = Path(source).read_text(encoding="utf-8")
-    flat = _node_parameters(yaml.load(text, _Loader), source)
+    flat = read_flat(source)
     for name in [name for name, value in flat.items() if value in (None, "")]:
         del flat[name]
         flat |= _numbers([name.removeprefix("effects.")], [])

@@ -98,7 +98,7 @@ class Flag(IntFlag):
 _FLAGS = (1 << 11) - 1
 
 RESET_CAUSES = {0: "power-on", 1: "reset line", 2: "brown-out", 3: "watchdog", 4: "JTAG"}
-"""By bit of MCUSR (ATmega2560 datasheet 12.5.1)."""
+"""Reset causes by bit of MCUSR (data sheet of the ATmega2560, 12.5.1)."""
 
 
 class Sample(NamedTuple):

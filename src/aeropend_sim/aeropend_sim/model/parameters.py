@@ -227,25 +227,27 @@ def flatten(tree: Mapping[str, object], prefix: str = "") -> dict[str, object]:
 def load(source: str | Path) -> Model:
     """Read a preset (`bench`, `thesis`) or a model file.
 
-    Keys outside `model`, `sensing` and `effects` are parameters of a node and are ignored.
-
     Args:
         source: name of a preset, or path.
 
     Raises:
         ModelError: no such preset or file, not a ROS 2 parameter file, or a value in it cannot be used.
     """
-    if str(source) in PRESETS:
-        name, text = str(source), (files("aeropend_sim") / "config" / f"{source}.yaml").read_text(encoding="utf-8")
-    else:
-        name = str(source)
-        try:
-            text = Path(source).read_text(encoding="utf-8")
-        except FileNotFoundError:
-            raise ModelError(f"{source}: no such model file; give a file or a preset ({', '.join(PRESETS)})") from None
-        except (OSError, UnicodeDecodeError) as error:
-            reason = getattr(error, "strerror", None) or "not a text file"
-            raise ModelError(f"{source}: the model file cannot be read: {reason}") from None
+    return from_flat(read_flat(source), str(source))
+
+
+def read_flat(source: str | Path) -> dict[str, object]:
+    """Read the values of a preset or a model file, unchecked, by their dotted names.
+
+    Keys outside `model`, `sensing` and `effects` are parameters of a node and are left out.
+
+    Args:
+        source: name of a preset, or path.
+
+    Raises:
+        ModelError: no such preset or file, or not a ROS 2 parameter file.
+    """
+    name, text = str(source), _text(source)
     try:
         tree = load_yaml(text, _Loader)
     except yaml.MarkedYAMLError as error:
@@ -253,7 +255,20 @@ def load(source: str | Path) -> Model:
         raise ModelError(f"{name}: not valid YAML{line}: {error.problem}; see the presets for the form") from None
     except yaml.YAMLError:
         raise ModelError(f"{name}: not a model file; see the presets for the form") from None
-    return from_flat(_node_parameters(tree, name), name)
+    return _node_parameters(tree, name)
+
+
+def _text(source: str | Path) -> str:
+    """Text of a preset or a model file."""
+    if str(source) in PRESETS:
+        return (files("aeropend_sim") / "config" / f"{source}.yaml").read_text(encoding="utf-8")
+    try:
+        return Path(source).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ModelError(f"{source}: no such model file; give a file or a preset ({', '.join(PRESETS)})") from None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not a text file"
+        raise ModelError(f"{source}: the model file cannot be read: {reason}") from None
 
 
 class _Loader(yaml.SafeLoader):
