@@ -346,7 +346,7 @@ BAD = {
     FL: (parameters(kp=-1.0), "kp = -1 1/s² is out of range"),
     "cascade": (parameters(gains="mine"), "one of tuned, thesis"),
     "feedback_linearization_cascade": (parameters(reference_max=0.0), "reference_min < reference_max"),
-    "reference": (["much"], "'much' is no number"),
+    "reference": (["much"], "'much' is not a number"),
     "step_test": (["--hold", "0"], "give 0.5 to 600 s"),
 }
 

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import pytest
 
-from aeropend_control.nodes import reference, step_run
-from aeropend_sim.errors import UserError
+from aeropend_control.nodes import step_run
 
 
 def test_the_defaults_make_a_folder_of_their_own():
@@ -32,11 +31,3 @@ def test_what_cannot_be_used_is_said_in_one_line(capsys, words, said):
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("step_test: ")
     assert said in line
-
-
-def test_a_reference_is_one_number():
-    assert reference.value_of(["0.4"]) == 0.4
-    assert reference.value_of(["-0.1"]) == -0.1
-    for words in ([], ["0.4", "0.5"], ["much"]):
-        with pytest.raises(UserError, match=r"reference 0\.4"):
-            reference.value_of(words)

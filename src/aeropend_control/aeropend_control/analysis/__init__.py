@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tuning, stability margins and step responses."""
+"""Simulated closed loops, stability margins and step responses."""

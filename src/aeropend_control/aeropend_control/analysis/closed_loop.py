@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A control law and a simulated rig in a loop, sample by sample."""
+"""Closed loop of a control law and a simulated rig, without ROS."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ Array = NDArray[np.float64]
 
 
 class ClosedLoop(NamedTuple):
-    """What happened; every array (N,).
+    """A recorded closed loop.
 
     Attributes:
-        time: s. reference: what the law was asked for. duty: applied from each sample on.
-        measured: what the rig reports, by the names of `Sample`.
-        truth: its true states, by the names of `Truth`.
+        time: [s] (N,).
+        reference: (N,) in the unit of the law's reference.
+        duty: [0..1] (N,) applied from each sample on.
+        measured: (N,) each; the readings, by the fields of `Sample`.
+        truth: (N,) each; the true states, by the fields of `Truth`.
     """
 
     time: Array
@@ -33,14 +35,14 @@ class ClosedLoop(NamedTuple):
 
 
 def run(law: Law, rig: Rig, reference: ArrayLike) -> ClosedLoop:
-    """Let a law control a rig; both are reset first.
+    """Run a law and a rig in closed loop; both are reset first.
 
-    What the law returns for a sample acts from the next one on, as over the graph.
+    The duty for a sample acts from the next sample on, as in the ROS graph.
 
     Args:
         law: the control law.
-        rig: stands for the real one, or is a model of it.
-        reference: (N,), one for each sample.
+        rig: the simulated rig.
+        reference: (N,) a reference for each sample.
     """
     law.reset()
     rig.reset()
@@ -57,10 +59,23 @@ def run(law: Law, rig: Rig, reference: ArrayLike) -> ClosedLoop:
 
 
 def predict(law: Law, model: Model, reference: ArrayLike, seed: int = 0) -> ClosedLoop:
-    """What a law does on a model, its measurement chain included; `seed` is of all chance."""
+    """Run a law in closed loop with a model and its measurement chain.
+
+    Args:
+        law: the control law.
+        model: the model of the rig.
+        reference: (N,) a reference for each sample.
+        seed: of all random numbers.
+    """
     return run(law, Rig(model, seed), reference)
 
 
 def staircase(levels: Sequence[float], hold: float, period: float = SAMPLE_PERIOD) -> Array:
-    """A reference (N,) that holds each level for `hold` s."""
+    """A reference (N,) that is constant at each level.
+
+    Args:
+        levels: values of the reference.
+        hold: [s] time at each level.
+        period: [s] between samples.
+    """
     return np.repeat(np.asarray(levels, dtype=float), round(hold / period))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stability margins of a law on a model, with the delay of the loop: measured on the very code that runs.
+"""Stability margins of a law with a model, measured in a simulation of the code that runs.
 
-The loop is opened, in thought, at the duty. A small sum of sines is added to the duty while the law holds an operating
-point; the ratio of what the law gives back to what is applied is the loop's gain at these frequencies. So observer,
-sampling and the sample of delay are in it, and nothing has to be derived twice.
+A small multisine is added to the duty while the law holds an operating point. The ratio of the law's output to the
+applied duty is the loop gain at the frequencies of the multisine. So it includes the observer, the sampling and the
+delay of one sample.
 """
 
 from __future__ import annotations
@@ -17,32 +17,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_control.laws.registry import LAWS
-from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 from aeropend_sim.model.rig import Rig
 
 Array = NDArray[np.float64]
 
 SETTLE, PERIOD = 5.0, 8.0
-"""s to reach the operating point, and the period of the sum of sines; two are run, the second is used."""
+"""[s] Time to reach the operating point, and period of the multisine (choices). The second of two periods is used."""
 
 LINES = 48
-"""Frequencies, spaced evenly in their logarithms from one per `PERIOD` to `HIGHEST`."""
+"""Number of frequencies, spaced logarithmically from 1/`PERIOD` to `HIGHEST` (choice); equal ones count once."""
 
 HIGHEST = 40.0
-"""Hz."""
+"""[Hz] Highest frequency (choice; far above the crossover of every tuned law)."""
 
 AMPLITUDE = 2e-4
-"""Duty of each sine."""
+"""Amplitude of each sine, as a duty (choice; small, so that the loop stays linear)."""
+
+RANDOM = ("gust", "speed_spikes")
+"""Effects that are random; the loop gain is measured without them."""
+
+EXACT = ("angle_lsb", "angle_noise", "current_lsb", "current_noise", "voltage_lsb", "voltage_noise", "speed_tick",
+         "speed_noise")
+"""Noise and quantisation of the sensors; the loop gain is measured without them."""
+
+TURNS = range(-5, 5)
+"""Multiples of 2π at which the phase may cross -π (choice; more than any loop here has)."""
+
+RESTLESS = (0.1, 0.2)
+"""Shares of the reference by which a loop may still move before and during the measurement (choices)."""
 
 
 class Margins(NamedTuple):
-    """How far a loop is from instability.
+    """Stability margins of a loop.
 
     Attributes:
-        gain: factor by which the loop's gain may rise; inf if by any. phase: rad of lag that it bears.
-        delay: s of further delay that it bears. crossover: rad/s at which the loop's gain passes 1.
-        frequency: (F,) rad/s, and loop: (F,) complex gain there.
+        gain: gain margin, a factor; inf if the loop is stable for every higher gain.
+        phase: [rad] phase margin.
+        delay: [s] delay margin.
+        crossover: [rad/s] frequency at which the magnitude of the loop gain is 1.
+        frequency: [rad/s] (F,).
+        loop: (F,) complex loop gain.
     """
 
     gain: float
@@ -54,7 +69,7 @@ class Margins(NamedTuple):
 
 
 class MarginError(ValueError):
-    """A loop without margins, since it does not come to rest; the message is one line for a person."""
+    """The loop does not come to rest, so it has no margins; the message is one line for the user."""
 
 
 def margins(model: Model, law: str, gains: Mapping[str, float] | None = None, at: float = 0.4,
@@ -62,27 +77,25 @@ def margins(model: Model, law: str, gains: Mapping[str, float] | None = None, at
     """Margins of a law around an operating point.
 
     Args:
-        model: what the law knows.
+        model: the model that the law uses.
         law: its name in `LAWS`.
-        gains: by name; the tuned ones by default.
-        at: rad, or rad/s for the cascade.
-        on: the model of the rig, if that is another.
+        gains: by name; None: the tuned gains.
+        at: [rad, or rad/s for the cascade] reference at the operating point.
+        on: the model of the rig; None: `model`.
 
     Raises:
         MarginError: the loop does not come to rest there.
-        GainError: a gain that cannot be used.
+        GainError: a gain cannot be used.
     """
-    exact = ("angle_lsb", "angle_noise", "current_lsb", "current_noise", "voltage_lsb", "voltage_noise", "speed_tick",
-             "speed_noise")
     rig_model = on or model
-    quiet = {id_: p for id_, p in rig_model.effects.items() if id_ not in CHANCE}
-    rig = Rig(replace(rig_model, sensing={**rig_model.sensing, **dict.fromkeys(exact, 0.0)}, effects=quiet))
+    quiet = {id_: p for id_, p in rig_model.effects.items() if id_ not in RANDOM}
+    rig = Rig(replace(rig_model, sensing={**rig_model.sensing, **dict.fromkeys(EXACT, 0.0)}, effects=quiet))
     kind = LAWS[law]
     controller = kind.make(model, gains)
     controller.reset()
     settle, n = round(SETTLE / SAMPLE_PERIOD), round(PERIOD / SAMPLE_PERIOD)
     lines = np.unique(np.round(np.geomspace(1.0, HIGHEST * PERIOD, LINES)).astype(int))
-    phases = math.pi * np.arange(len(lines)) ** 2 / len(lines)  # Schroeder's: a low crest
+    phases = math.pi * np.arange(len(lines)) ** 2 / len(lines)  # Schroeder phases: a low crest factor
     added = AMPLITUDE * np.cos(2.0 * math.pi * np.outer(np.arange(n) / n, lines) + phases).sum(axis=1)
     given = np.zeros(settle + 2 * n)
     seen = np.zeros(len(given))
@@ -93,19 +106,20 @@ def margins(model: Model, law: str, gains: Mapping[str, float] | None = None, at
         sample, truth = rig.sample(min(max(applied, 0.0), 1.0))
         seen[k] = getattr(truth, kind.measures)
         duty = controller.step(sample, at)
-    if np.ptp(seen[-n:]) > 0.2 * at or np.ptp(seen[settle - n // 4:settle]) > 0.1 * at:
+    if np.ptp(seen[-n:]) > RESTLESS[1] * at or np.ptp(seen[settle - n // 4:settle]) > RESTLESS[0] * at:
         raise MarginError(f"{law} does not come to rest at {at:g} {kind.reference_unit}: there are no margins")
     back = np.fft.rfft(given[-n:])[lines]
     loop = -back / (back + np.fft.rfft(added)[lines])
     return from_response(2.0 * math.pi * lines / PERIOD, loop)
 
 
-CHANCE = tuple(id_ for id_ in CATALOGUE if id_ in ("gust", "speed_spikes"))
-"""Effects that are noise."""
-
-
 def from_response(frequency: Array, loop: NDArray[np.complex128]) -> Margins:
-    """Margins of a loop's gain, complex (F,), at rising frequencies (F,), rad/s."""
+    """Margins from a frequency response.
+
+    Args:
+        frequency: [rad/s] (F,) rising.
+        loop: (F,) complex loop gain.
+    """
     size, phase, log_f = np.log(np.abs(loop)), np.unwrap(np.angle(loop)), np.log(frequency)
     gain, least, delay, crossover = math.inf, math.inf, math.inf, math.nan
     for k in range(len(frequency) - 1):
@@ -117,7 +131,7 @@ def from_response(frequency: Array, loop: NDArray[np.complex128]) -> Margins:
             if short < least:
                 least, crossover = short, omega
             delay = min(delay, left / omega)
-        for turn in range(-5, 5):
+        for turn in TURNS:
             a, b = phase[k] - math.pi * (2 * turn + 1), phase[k + 1] - math.pi * (2 * turn + 1)
             if a * b < 0.0:
                 at = size[k] + a / (a - b) * (size[k + 1] - size[k])

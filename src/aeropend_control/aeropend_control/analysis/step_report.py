@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A test of steps as a document: the samples on their grid, the figures beside their limits, a table, a drawing."""
+"""Report of a step test: samples on a uniform grid, figures and their limits, a table, a CSV file, a drawing."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ UNITS = {"time": "s", "theta": "rad", "omega": "rad/s", "i_a": "A", "v_a": "V", 
 
 
 class Limits(NamedTuple):
-    """What a step response may take at most: times in s, overshoot as a share, steady-state error in the unit of y."""
+    """Limits of a step response: times [s], overshoot [share], steady-state error [unit of the response]."""
 
     rise_time: float
     peak_time: float
@@ -39,16 +39,16 @@ class Limits(NamedTuple):
 
 
 ANGLE = Limits(*TABLE_6_1, math.radians(0.5))
-"""Of the arm: the thesis' Table 6.1, and half a degree."""
+"""Limits of the laws of the angle: Table 6.1 of the thesis, and a steady-state error of half a degree (choice)."""
 
 LIMITS = {
     "feedback_linearization_cascade": ANGLE._replace(settling_time=1.2, overshoot=0.05),
     "cascade": Limits(*REQUIREMENTS, math.inf)._replace(peak_time=math.inf),  # the thesis has none for it
 }
-"""Of the laws that must do better, or control something else."""
+"""Limits of the laws that must do better, or control the rotor's speed."""
 
 MOST_MISSING = 100
-"""Samples that may be missing for each that is there."""
+"""Greatest ratio of missing samples to samples (choice; it bounds the memory for a wrong stamp)."""
 
 _SHOWN = {  # name: heading, factor, unit, digits
     "rise_time": ("t_r", 1.0, "s", 3),
@@ -60,24 +60,24 @@ _SHOWN = {  # name: heading, factor, unit, digits
 
 
 def limits(law: str) -> Limits:
-    """What the responses of a law are held against."""
+    """Limits of the step responses of a law (its name in `LAWS`)."""
     return LIMITS.get(law, ANGLE)
 
 
 def on_grid(time: ArrayLike, columns: Mapping[str, ArrayLike], period: float = SAMPLE_PERIOD
             ) -> tuple[Array, dict[str, Array], int]:
-    """Put samples on a uniform grid, those that are missing by straight lines.
+    """Put samples on a uniform grid; missing ones are interpolated linearly.
 
     Args:
-        time: (N,) s, rising.
-        columns: (N,) each; NaN where there is no reading.
-        period: s.
+        time: [s] (N,) rising.
+        columns: (N,) each; NaN where a reading is missing.
+        period: [s] of the grid.
 
     Returns:
-        Time (M,), the columns (M,), and how many of M samples were missing.
+        Time [s] (M,), the columns (M,), and the number of missing samples.
 
     Raises:
-        StepError: next to none is there.
+        StepError: nearly all samples are missing.
     """
     t = np.asarray(time, dtype=float)
     count = round((t[-1] - t[0]) / period) + 1
@@ -93,22 +93,27 @@ def on_grid(time: ArrayLike, columns: Mapping[str, ArrayLike], period: float = S
 
 
 def missed(step: StepResponse, limit: Limits) -> list[str]:
-    """The names of what a response does not keep; a response that never gets there does not keep it."""
+    """Names of the limits that a response exceeds.
+
+    Args:
+        step: the response; a time that it does not reach exceeds the limit.
+        limit: the limits.
+    """
     out = []
     for name, most in limit._asdict().items():
         value = abs(getattr(step, name))
-        no_peak = name == "peak_time" and math.isnan(value)  # nothing to be late
+        no_peak = name == "peak_time" and math.isnan(value)  # no overshoot, so no peak time
         if not (value <= most or no_peak or most == math.inf):
             out.append(name)
     return out
 
 
 def table(laws: Mapping[str, Sequence[StepResponse]], unit: Mapping[str, str] | None = None) -> Table:
-    """One row a step, and the limits of each law below its steps; what is missed is marked with ✗.
+    """Table with a row for each step, and the limits of each law below its steps; ✗ marks a missed limit.
 
     Args:
         laws: responses by the name of the law.
-        unit: of each law's reference; rad where it is not given.
+        unit: unit of each law's reference; rad if missing.
     """
     shown = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     shown.add_column("law", overflow="fold")
@@ -132,7 +137,12 @@ def _cell(name: str, value: float, off: Sequence[str]) -> str:
 
 
 def write_csv(path: Path, columns: Mapping[str, Array]) -> None:
-    """Write columns (N,) with their names and units on top."""
+    """Write a CSV file with names and units in the first line.
+
+    Args:
+        path: of the file.
+        columns: (N,) each.
+    """
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(f"{name} ({UNITS[name]})" if name in UNITS else name for name in columns)
@@ -140,15 +150,15 @@ def write_csv(path: Path, columns: Mapping[str, Array]) -> None:
 
 
 def draw(time: Array, reference: Array, y: Array, duty: Array, title: str, unit: str) -> str:
-    """The response with its reference, and the duty below, as an SVG image.
+    """SVG image of the response with its reference, and the duty below.
 
     Args:
-        time: [s] (N,) instants.
-        reference: (N,) reference, in `unit`.
+        time: [s] (N,).
+        reference: (N,) in `unit`.
         y: (N,) response, in `unit`.
-        duty: (N,) 0 to 1.
-        title: on top of the image.
-        unit: of reference and response.
+        duty: [0..1] (N,).
+        title: above the image.
+        unit: name of the axis of reference and response.
     """
     left, width, panels = 70.0, 800.0, ((40.0, 300.0), (390.0, 120.0))
     thin = slice(None, None, max(1, len(time) // 1000))

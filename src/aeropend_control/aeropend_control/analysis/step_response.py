@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What describes a step response: t_r, t_p, t_s, M_p and the steady-state error, from recorded arrays."""
+"""Figures of a recorded step response: t_r, t_p, t_s, M_p and the steady-state error."""
 
 from __future__ import annotations
 
@@ -15,27 +15,29 @@ from aeropend_sim.model.step_features import step_features
 Array = NDArray[np.float64]
 
 SETTLED_SHARE = 0.2
-"""The last share of a step over which the final value is the mean."""
+"""Share of a step, at its end, whose mean is the final value (choice)."""
 
 RESOLVED = 4.0
-"""A step less than this many times the noise of the response cannot be told from it."""
+"""Least height of a step or of an overshoot, in standard deviations of the noise of the response (choice)."""
 
 
 class StepError(ValueError):
-    """A recording without a step that can be described; the message is one line for a person."""
+    """The recording has no step that can be described; the message is one line for the user."""
 
 
 class StepResponse(NamedTuple):
-    """A step and the response to it; times in s from the step, NaN where the response does not get that far.
+    """A step and the response to it. Times count from the step; NaN if the response does not reach the event.
 
     Attributes:
-        start: s, when the reference stepped. reference: the new one.
-        initial: of the response. final: what it came to.
-        rise_time: t_r, from 10 % to 90 % of the way.
-        peak_time: t_p, of the highest peak; NaN where there is no overshoot.
-        settling_time: t_s, after which it stays within 2 % of the way.
-        overshoot: M_p, as a share of the way; 0 where it never passes the final value by more than its noise.
-        steady_state_error: reference less final value.
+        start: [s] time of the step.
+        reference: value of the reference after the step.
+        initial: value of the response at the step.
+        final: value of the response at the end.
+        rise_time: [s] t_r, from 10 % to 90 % of the height of the step.
+        peak_time: [s] t_p, of the highest peak; NaN without overshoot.
+        settling_time: [s] t_s, after which the response stays within 2 % of the height of the step.
+        overshoot: M_p, as a share of the height of the step; 0 if it is not above the noise.
+        steady_state_error: reference minus final value.
     """
 
     start: float
@@ -52,21 +54,21 @@ class StepResponse(NamedTuple):
 def step_responses(time: ArrayLike, y: ArrayLike, reference: ArrayLike, smoothing: float = 0.06) -> list[StepResponse]:
     """Describe the response to every step of a reference that is constant between its steps.
 
-    The response is smoothed by local parabolas without lag, so that noise and quantisation neither pass for an
-    overshoot nor for leaving the 2 % band. A step lasts until the next; before the first, the reference is taken to
-    have been where the response starts.
+    The response is smoothed by local parabolas without lag (Savitzky-Golay), so that noise and quantisation are not
+    taken for an overshoot or an exit from the 2 % band. A step lasts until the next one. Before the first step the
+    reference is assumed to be equal to the response.
 
     Args:
-        time: (N,) s, uniform and rising.
+        time: [s] (N,) uniform and rising.
         y: (N,) response.
-        reference: (N,), in the unit of y.
-        smoothing: s, width of the parabolas; 0: none.
+        reference: (N,) in the unit of `y`.
+        smoothing: [s] width of the parabolas; 0: none.
 
     Returns:
-        One entry for each step, in sequence.
+        An entry for each step, in order of time.
 
     Raises:
-        StepError: no step, arrays that do not fit each other, NaN, or a response that does not move.
+        StepError: no step, arrays of different lengths, NaN, or a response that does not move.
     """
     time, y, reference = (np.asarray(x, dtype=float) for x in (time, y, reference))
     if not time.shape == y.shape == reference.shape or time.ndim != 1:
@@ -89,7 +91,7 @@ def step_responses(time: ArrayLike, y: ArrayLike, reference: ArrayLike, smoothin
 
 
 def _smoothed(time: Array, y: Array, width: float) -> tuple[Array, float]:
-    """The response (N,) with its noise taken down, and the standard deviation of what is left of that."""
+    """The smoothed response (N,), and the standard deviation of its remaining noise."""
     from scipy.signal import savgol_coeffs, savgol_filter  # takes long to import
 
     noise = math.sqrt(float(np.mean(np.diff(y, 2) ** 2)) / 6.0) if len(y) > 2 else 0.0
@@ -109,7 +111,7 @@ def _describe(time: Array, y: Array, reference: float, initial: float, noise: fl
     way = abs(final - initial)
     if way <= RESOLVED * noise or way == 0.0:
         raise StepError(f"the response does not move after the step to {reference:g} at {start:g} s; "
-                        "is the law on, and the reference within its range?")
+                        "is the controller on, and the reference within its range?")
     up = math.copysign(1.0, final - initial)
     f = step_features(time - start, up * (y - initial), way)
     peaks = f.overshoot * way > RESOLVED * noise

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands that start no node."""
+"""Commands that are not nodes."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gains of a law from requirements and a model file, with the margins and the step responses that they give."""
+"""Calculate the gains of a law for a model and requirements, and show the stability margins and step responses."""
 
 from __future__ import annotations
 
@@ -21,10 +21,14 @@ from aeropend_sim.cli.progress import Show, nothing, progress
 from aeropend_sim.model.parameters import Model, ModelError, load
 
 LEVELS = {"theta": (0.2, 0.4, 0.7), "omega": (60.0, 99.5, 140.0)}
-"""Steps from rest that are predicted, and operating points whose margins are shown: rad, rad/s."""
+"""[rad], [rad/s] Steps from rest that are simulated, and operating points of the margins; 99.5 rad/s is the thesis'
+950 RPM, the others are choices."""
 
 HOLD = 5.0
-"""s for which a step is predicted."""
+"""[s] Time for which a step is simulated (choice)."""
+
+SMOOTHING = {"theta": 0.06, "omega": 0.0}
+"""[s] Smoothing of a step response, by what is measured; a simulated speed needs none (choices)."""
 
 EXAMPLES = f"""examples:
   tune feedback_linearization
@@ -35,24 +39,30 @@ EXAMPLES = f"""examples:
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Read the command line; exits with 2 and one line where it is wrong."""
+    """Read the command line; exits with code 2 and one line if it is wrong."""
     parser = Parser(prog="tune", description=__doc__, epilog=EXAMPLES,
                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("law", choices=list(LAWS), metavar="LAW", help=f"one of {', '.join(LAWS)}")
     parser.add_argument("--model", default="bench", metavar="PRESET|FILE",
                         help="preset (bench, thesis) or model file (default: bench)")
-    parser.add_argument("--gains", metavar="PRESET", help="show these instead of tuning: thesis")
+    parser.add_argument("--gains", metavar="PRESET", help="show a set of gains instead of tuning: thesis")
     for name, unit in (("t_r", "s"), ("t_p", "s"), ("t_s", "s"), ("M_p", "share")):
         parser.add_argument("--" + name.lower().replace("_", "-"), dest=name, type=float, metavar=unit.upper(),
-                            help=f"{name} at most, {unit} (default: the thesis' requirement)")
+                            help=f"greatest {name}, {unit} (default: the thesis' requirement)")
     return parser.parse_args(arguments)
 
 
 def chosen_gains(kind: LawKind, model: Model, options: argparse.Namespace) -> dict[str, float]:
-    """Gains as the command line asks for.
+    """Gains by the options of the command line.
+
+    Args:
+        kind: the law.
+        model: the model of the rig.
+        options: of the command line.
 
     Raises:
-        GainError: no such preset. TuningError: requirements that cannot be met.
+        GainError: there is no such preset.
+        TuningError: a requirement cannot be met.
     """
     if options.gains is not None:
         if options.gains not in kind.presets:
@@ -63,7 +73,7 @@ def chosen_gains(kind: LawKind, model: Model, options: argparse.Namespace) -> di
 
 
 def gains_table(kind: LawKind, gains: Mapping[str, float]) -> Table:
-    """One row a gain."""
+    """Table with a row for each gain (values by name)."""
     out = Table(box=box.SIMPLE)
     for name in ("gain", "value", "unit", "meaning"):
         out.add_column(name, justify="right" if name == "value" else "left")
@@ -72,8 +82,15 @@ def gains_table(kind: LawKind, gains: Mapping[str, float]) -> Table:
     return out
 
 
-def answers_table(law: str, model: Model, gains: Mapping[str, float], show: Show = nothing) -> Table:
-    """One row a level: the predicted answer to a step from rest, and the margins there."""
+def responses_table(law: str, model: Model, gains: Mapping[str, float], show: Show = nothing) -> Table:
+    """Table with a row for each level: the simulated response to a step from rest, and the margins at the level.
+
+    Args:
+        law: its name in `LAWS`.
+        model: the model of the rig.
+        gains: by name.
+        show: gets the share that is done.
+    """
     kind = LAWS[law]
     out = Table(box=box.SIMPLE)
     headings = (f"step to / {kind.reference_unit}", "t_r / s", "t_p / s", "t_s / s", "M_p / %", "gain margin",
@@ -83,15 +100,15 @@ def answers_table(law: str, model: Model, gains: Mapping[str, float], show: Show
     levels = LEVELS[kind.measures]
     for number, level in enumerate(levels):
         show(number / len(levels))
-        out.add_row(f"{level:g}", *_answer(kind, model, gains, level), *_margins(law, model, gains, level))
+        out.add_row(f"{level:g}", *_response(kind, model, gains, level), *_margins(law, model, gains, level))
     return out
 
 
-def _answer(kind: LawKind, model: Model, gains: Mapping[str, float], level: float) -> list[str]:
+def _response(kind: LawKind, model: Model, gains: Mapping[str, float], level: float) -> list[str]:
     run = closed_loop.predict(kind.make(model, gains), model, closed_loop.staircase([level], HOLD))
     try:
         s: StepResponse = step_responses(run.time, run.truth[kind.measures], run.reference,
-                                         0.06 if kind.measures == "theta" else 0.0)[0]
+                                         SMOOTHING[kind.measures])[0]
     except StepError:
         return ["-"] * 4
     return [_number(s.rise_time, 3), _number(s.peak_time, 3), _number(s.settling_time, 2), f"{100.0 * s.overshoot:.1f}"]
@@ -123,9 +140,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console = Console(width=130)
     console.print(f"{options.law} on {model.name}: {kind.summary}")
     console.print(gains_table(kind, gains))
-    with progress("what these gains give") as show:
-        answers = answers_table(options.law, model, gains, show)
-    console.print(answers)
+    with progress("simulating steps and margins") as show:
+        responses = responses_table(options.law, model, gains, show)
+    console.print(responses)
     return 0
 
 

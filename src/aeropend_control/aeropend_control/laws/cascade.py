@@ -43,7 +43,7 @@ THESIS_GAINS = {"speed_kp": 0.1, "speed_ki": 1.5, "current_kp": 1.2, "current_ki
 REQUIREMENTS = Requirements(t_r=0.2, t_p=0.8, t_s=0.8, M_p=0.1)
 """Requirements of the thesis for a step to 950 RPM (6.7). It has none on t_p; that of 0.8 s is not used."""
 
-MOTION, STIFFNESS, SOFT = 7.8, 5.1, 2.0
+REFERENCE_FREQUENCY, LOOP_FREQUENCY, POLE_RATIO = 7.8, 5.1, 2.0
 """[rad/s], [rad/s], [-] For Table 6.1 with t_s = 1.2 s: frequency of the reference model; frequency of the dominant
 pole pair of the feedback loop; ratio of the decay of its other poles to that of the pair (compare
 `tuning.OTHER_POLES`). Choices; `tune` shows the margins and step responses with them."""
@@ -51,7 +51,7 @@ pole pair of the feedback loop; ratio of the decay of its other poles to that of
 CURRENT_LEAD = 3.0
 """Least ratio of the speed loop's time constant to the current loop's (choice; 3 to 5 is usual in cascades)."""
 
-OUT_OF_REACH = 0.5
+LARGEST_LOSS = 0.5
 """[rad/s²] Acceleration lost to the limits of the duty above which the reference model restarts (choice)."""
 
 CURRENT_SHARE = 0.3
@@ -221,13 +221,13 @@ class FeedbackLinearizationCascade(FeedbackLinearization):
         """
         air = model.effect("thrust_lag", "tau")
         slower = min(requirements.t_r / 0.5, requirements.t_p / 0.9, requirements.t_s / 1.2)
-        decay = STIFFNESS / slower * DAMPING
+        decay = LOOP_FREQUENCY / slower * DAMPING
         M_p = math.exp(-math.pi * DAMPING / math.sqrt(1.0 - DAMPING**2))
         t_s = -math.log(0.02 * math.sqrt(1.0 - DAMPING**2)) / decay
-        kp, ki, kd, _, follow = place(model, t_s, M_p, other_poles=SOFT)
+        kp, ki, kd, _, follow = place(model, t_s, M_p, other_poles=POLE_RATIO)
         follow = follow or thrust_lag(model, OPERATING_POINT)
         return {**_defaults(), "tracking_time": 0.0, "kp": kp, "ki": ki, "kd": kd, "setpoint_weight": 1.0,
-                "reference_time": slower / MOTION + 0.9 * air, "thrust_time": follow,
+                "reference_time": slower / REFERENCE_FREQUENCY + 0.9 * air, "thrust_time": follow,
                 **tune(model, follow - min(air, 0.5 * follow))}
 
     def reset(self, sample: Sample | None = None, duty: float = 0.0) -> None:
@@ -251,7 +251,7 @@ class FeedbackLinearizationCascade(FeedbackLinearization):
         if self._fresh:
             self._fresh = False
             self._reference_model.reset(s.theta)
-        elif abs(self._missed) > OUT_OF_REACH:  # continue from the state of the arm
+        elif abs(self._missed) > LARGEST_LOSS:  # continue from the state of the arm
             acceleration = estimate.drive + self._per_thrust(estimate) * s.thrust
             self._reference_model.reset(s.theta, s.theta_dot, acceleration)
         y, rate, acceleration, jerk = self._reference_model.step(reference)

@@ -81,7 +81,7 @@ LAWS: dict[str, LawKind] = {
     "feedback_linearization": LawKind("PID with feedback linearization", *ANGLE, FeedbackLinearization.parameters,
                                       FeedbackLinearization, FeedbackLinearization.tune,
                                       {"thesis": {**feedback_linearization.THESIS_GAINS, "thrust_time": 0.0}}),
-    "cascade": LawKind("cascade of speed PI and current PI, for the rotor's speed", "omega", "rad/s", (0.0, 200.0),
+    "cascade": LawKind("speed PI and current PI in cascade, for the rotor's speed", "omega", "rad/s", (0.0, 200.0),
                        Cascade.parameters, Cascade, Cascade.tune, {"thesis": cascade.THESIS_GAINS},
                        cascade.REQUIREMENTS),
     "feedback_linearization_cascade": LawKind(

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes: controllers, excitation, reference, step test."""
+"""The nodes: controllers, excitation, reference and step test."""

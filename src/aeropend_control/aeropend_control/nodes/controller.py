@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node that every control law runs in: topics, timing and safety.
 
-A sample of the rig is two messages with the same stamp, `joint_states` and `armature`. As soon as both are there the
-law is stepped, once a sample, and its duty is published on `duty_command`. Whether it is stepped, and whether its duty
-goes out, the `Supervisor` decides. However the node ends, duty 0 is the last command.
+A sample of the rig is two messages with the same stamp, `joint_states` and `armature`. When both have arrived, the node
+calls the law once and publishes its duty on `duty_command`. The `Supervisor` decides whether the law is called and
+whether its duty is published. The last command of the node is duty 0, however it ends.
 
-Gains and limits can be set while it runs: the law takes them without a bump, or refuses them and goes on.
+Gains and limits can be set while the node runs. The law takes them without a bump, or refuses them and continues.
 """
 
 from __future__ import annotations
@@ -40,40 +40,40 @@ from aeropend_sim.ros.settings import Setting, overrides, read_settings
 from aeropend_sim.ros.usage import Usage, usage
 
 WATCH_S = 0.01
-"""How often the node looks whether samples still come, s."""
+"""[s] Period of the check for missing samples (choice; a fifth of the default timeout)."""
 WAITING = 100
-"""Halves of samples that wait for their other half."""
+"""Number of half samples that wait for the other half (choice)."""
 AGAIN_S = 10.0
-"""A fault that was logged is logged again only when it has been away for longer, s."""
+"""[s] A fault is logged again only after it was absent for this time (choice)."""
 WARM_UP = 20
-"""Samples that a law is run on before the first real one, so that what it calls is compiled."""
+"""Number of samples that a law processes before the first real one, so that its functions are compiled (choice)."""
 
 ARM, ROTOR = interface.JOINTS
 TUNED = "tuned"
 
 
 def settings(kind: LawKind) -> dict[str, Setting]:
-    """Every parameter of a law's node but its gains."""
+    """The parameters of a law's node without its gains."""
     low, high = kind.reference_limits
     unit = kind.reference_unit
     return {
         "model": Setting(
-            "bench", "what the law is made for, a model file may be augmented.yaml too", choices=PRESETS, path=True
+            "bench", "model of the rig; a model file, for example augmented.yaml", choices=PRESETS, path=True
         ),
         "gains": Setting(
-            TUNED, "gains that are not given: computed for the model, or a set by name", choices=(TUNED, *kind.presets)
+            TUNED, "source of gains that are not given: tuned for the model, or a set", choices=(TUNED, *kind.presets)
         ),
-        "reference_min": Setting(low, "least reference that is taken", unit, low, high, live=True),
-        "reference_max": Setting(high, "greatest reference that is taken", unit, low, high, live=True),
+        "reference_min": Setting(low, "least reference that is accepted", unit, low, high, live=True),
+        "reference_max": Setting(high, "greatest reference that is accepted", unit, low, high, live=True),
         "angle_limit": Setting(
-            1.4, "an arm beyond it, either way, gets duty 0 until the next reference", "rad", 0.1, math.pi, live=True
+            1.4, "beyond this angle, up or down, duty 0 until the next reference", "rad", 0.1, math.pi, live=True
         ),
         "timeout": Setting(0.05, "time without a sample after which the duty is 0", "s", 0.01, 10.0, live=True),
     }
 
 
 def usage_of(name: str) -> Usage:
-    """What `--help` of a law's node says."""
+    """Text of `--help` of a law's node."""
     kind = LAWS[name]
     gains = [
         f"  {gain:<18} {q.description}; {q.low:g}..{q.high:g} {q.unit}".removesuffix(" -")
@@ -81,7 +81,7 @@ def usage_of(name: str) -> Usage:
         for gain, q in kind.parameters.items()
     ]
     return usage(
-        f"{name}: {kind.summary}.\nTakes joint_states, armature and reference ({kind.reference_unit}), publishes "
+        f"{name}: {kind.summary}.\nReads joint_states, armature and reference ({kind.reference_unit}), publishes "
         "duty_command.",
         settings(kind),
         [
@@ -90,7 +90,7 @@ def usage_of(name: str) -> Usage:
             f"{name} --ros-args -r __ns:=/rig1 -p angle_limit:=1.0",
         ],
         "\n".join(
-            ["gains, given in the same way:", *gains, "", "Gains and limits can be set while it runs: ros2 param set."]
+            ["gains, set in the same way:", *gains, "", "Gains and limits can be set while it runs: ros2 param set."]
         ),
         further={gain: Setting(q.low, q.description) for gain, q in kind.parameters.items()},
     )
@@ -100,10 +100,10 @@ class Controller(Node):
     """A law in its node; see the module's docstring."""
 
     def __init__(self, name: str) -> None:
-        """Prepare a law.
+        """Prepare the node of a law.
 
         Args:
-            name: a key of `LAWS`, which is the node's name too.
+            name: a key of `LAWS`, which is also the name of the node.
 
         Raises:
             UserError: a parameter, the model file or a gain cannot be used.
@@ -123,7 +123,7 @@ class Controller(Node):
         self._joints: dict[int, tuple[float, float]] = {}
         self._armatures: dict[int, list[float]] = {}
         self._heard = False
-        self._quiet = 0  # looks since the last sample
+        self._quiet = 0  # checks since the last sample
         self._longest_ns = 0
         self._malformed = 0  # messages
         self._logged: dict[str, float] = {}
@@ -134,18 +134,18 @@ class Controller(Node):
         self.create_subscription(JointState, interface.JOINT_STATES, self._on_joint_states, qos, raw=True)
         self.create_subscription(BatteryState, interface.ARMATURE, self._on_armature, qos, raw=True)
         self.create_subscription(Float64, interface.REFERENCE, self._on_reference, qos)
-        # wall time: where no sample comes, no /clock moves either
+        # wall time: without samples /clock does not move either
         self._watch = self.create_timer(WATCH_S, self._on_watch, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._diagnostics = Diagnostics(self, self._report, name)
         self.add_on_set_parameters_callback(self._on_set_parameters)
-        said = ", ".join(f"{key} {values[key]:.4g}" for key in self._kind.parameters)
-        self.get_logger().info(f"model {values['model']}, {said}")
+        gains = ", ".join(f"{key} {values[key]:.4g}" for key in self._kind.parameters)
+        self.get_logger().info(f"model {values['model']}, {gains}")
         gc.collect()
-        gc.freeze()  # the collector need not look at all this between two samples
+        gc.freeze()  # the garbage collector skips these objects between two samples
         request_realtime_priority()
 
     def close(self) -> None:
-        """Send duty 0 ten times over 0.2 s: confirmation by the middleware would take up to 3 s (its heartbeat)."""
+        """Send duty 0 ten times in 0.2 s. A confirmation by the middleware would take up to 3 s (its heartbeat)."""
         for _ in range(10):
             self._publisher.publish(Float64(data=0.0))
             time.sleep(0.02)
@@ -153,10 +153,10 @@ class Controller(Node):
     # ---- parameters ------------------------------------------------------------------------------------------------
 
     def _read(self) -> dict[str, Any]:
-        """Make the law of the parameters given, and declare them all."""
+        """Make the law from the given parameters, and declare all parameters."""
         given = overrides(self)
         if any(name.startswith(("model.", "sensing.", "effects.")) for name in given):
-            raise UserError("the numbers of a model come as a file: -p model:=FILE")
+            raise UserError("give the parameters of a model as a file: -p model:=FILE")
         table = settings(self._kind)
         source, choice = (table[name].check(name, given.get(name, table[name].default)) for name in ("model", "gains"))
         try:
@@ -178,7 +178,7 @@ class Controller(Node):
         return values
 
     def _on_set_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
-        """Take all of these, or none."""
+        """Set all of these parameters, or none."""
         named = {one.name: one.value for one in parameters if one.name in self._table}
         supervisor = self._supervisor
         try:
@@ -186,7 +186,7 @@ class Controller(Node):
             _check_order({"reference_min": supervisor.low, "reference_max": supervisor.high, **new})
             self._law.retune({name: value for name, value in new.items() if name in self._kind.parameters})
         except (UserError, GainError) as error:
-            self.get_logger().warn(f"refused, and the loop goes on: {error}")
+            self.get_logger().warn(f"parameters refused, the loop continues: {error}")
             return SetParametersResult(successful=False, reason=str(error))
         supervisor.low = new.get("reference_min", supervisor.low)
         supervisor.high = new.get("reference_max", supervisor.high)
@@ -231,30 +231,30 @@ class Controller(Node):
             self._publisher.publish(wire.float64(duty))
             self._longest_ns = max(self._longest_ns, time.monotonic_ns() - start)
         if supervisor.fault:
-            self._say(supervisor.fault)
+            self._log_fault(supervisor.fault)
 
     def _on_reference(self, message: Float64) -> None:
         supervisor = self._supervisor
         before = supervisor.reference
         if not supervisor.set_reference(message.data):
-            self._say(supervisor.refusal)
+            self._log_fault(supervisor.refusal)
         elif supervisor.reference != before:
             self.get_logger().info(f"reference {supervisor.reference:g} {self._kind.reference_unit}")
 
     def _on_watch(self) -> None:
-        # looks are counted, not time: when this process stood still, samples wait in the queue behind the first look
+        # count checks, not time: if this process was stopped, samples wait in the queue behind the first check
         self._quiet += 1
         supervisor = self._supervisor
         if self._heard and self._quiet * WATCH_S > supervisor.timeout:
             self._heard = False
             supervisor.on_timeout()
             self._publisher.publish(Float64(data=0.0))
-            self._say(supervisor.fault)
+            self._log_fault(supervisor.fault)
 
-    # ---- what is told ----------------------------------------------------------------------------------------------
+    # ---- log and diagnostics ---------------------------------------------------------------------------------------
 
-    def _say(self, fault: str) -> None:
-        """Log a fault once, and again when it has been away for a while."""
+    def _log_fault(self, fault: str) -> None:
+        """Log a fault once, and again after it was absent for `AGAIN_S`."""
         now = time.monotonic()
         if now > self._logged.get(fault, -math.inf) + AGAIN_S:
             self.get_logger().warn(fault)
@@ -267,9 +267,9 @@ class Controller(Node):
             others = self.count_publishers(topic) - ours
             if others > 0:
                 warnings.append(f"{others + 1} publishers of {topic}: end all but one")
-                self._say(warnings[-1])
+                self._log_fault(warnings[-1])
         if not self._heard and not supervisor.fault:
-            warnings.append("no sample yet, which is joint_states and armature with the same stamp: duty 0")
+            warnings.append("no sample yet (joint_states and armature with the same stamp): duty 0")
         values = {
             "reference": supervisor.reference,
             "duty": supervisor.duty,
@@ -282,7 +282,7 @@ class Controller(Node):
 
 
 def _keep(waiting: dict[int, Any], stamp: int, half: Any) -> None:
-    """Let half a sample wait for the other; what waits too long goes."""
+    """Store half a sample until the other half arrives; drop the oldest if there are too many."""
     waiting[stamp] = half
     if len(waiting) > WAITING:
         del waiting[next(iter(waiting))]
@@ -294,14 +294,22 @@ def _check_order(values: Mapping[str, float]) -> None:
 
 
 def _warm_up(law: Law, kind: LawKind) -> None:
-    """Run a law so that its first real sample finds everything compiled."""
+    """Run a law so that all its functions are compiled before the first real sample."""
     for k in range(WARM_UP):
         law.step(Sample(0.01 * k, 50.0, 0.1, 0.5), sum(kind.reference_limits) / 2.0)
     law.reset()
 
 
 def main(name: str, args: Sequence[str] | None = None) -> int:
-    """Run the node of a law."""
+    """Run the node of a law.
+
+    Args:
+        name: a key of `LAWS`.
+        args: arguments of the command line; None: those of the process.
+
+    Returns:
+        The exit code.
+    """
     return run(partial(Controller, name), args, usage_of(name))
 
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives a rig, simulated or real, with a duty signal, and ends with duty 0.
+"""Excitation of a simulated or real rig by a duty signal.
 
-It waits until somebody listens to `duty_command`, then publishes each change of the duty when it is due and repeats the
-duty at least every 20 ms, so that a board that switches off without commands (100 ms) stays on. Time is the node's
-clock: with `use_sim_time` it follows `/clock` at whatever speed. A duty that is overdue because the process stood still
-is left out, not sent late. However the node ends, duty 0 is the last command.
+The node waits for a subscriber of `duty_command`. Then it publishes each change of the duty at its time, and repeats
+the duty at least every 20 ms, because a board switches off after 100 ms without a command. Time is the node's clock:
+with `use_sim_time` it follows `/clock` at any speed. If the process was stopped, overdue duties are skipped and not
+sent late. The last command of the node is duty 0, however it ends.
 """
 
 import sys
@@ -33,9 +33,9 @@ from aeropend_sim.ros.worker import Worker
 
 PERIOD_NS = round(SAMPLE_PERIOD * 1e9)
 REPEAT = 9
-"""Samples between repetitions of the same duty: 18.4 ms."""
+"""[samples] Time between repetitions of the same duty: 18.4 ms, well below the board's 100 ms."""
 NEWS_S = 5.0
-"""Time between lines on progress when there is no terminal, s."""
+"""[s] Time between lines on progress if there is no terminal (choice)."""
 
 _DEFAULT = Excitation()
 SETTINGS = {
@@ -71,14 +71,14 @@ USAGE = usage(
 
 
 def changes(series: np.ndarray, repeat: int = REPEAT) -> np.ndarray:
-    """Return the samples at which a signal must be published: where it changes, and every `repeat` samples in between.
+    """Samples at which a signal must be published: where it changes, and every `repeat` samples in between.
 
     Args:
-        series: (N,) duty.
-        repeat: longest distance, samples.
+        series: [0..1] (N,) duty.
+        repeat: [samples] longest distance.
 
     Returns:
-        (M,) increasing indices; the first is 0.
+        (M,) rising indices; the first is 0.
     """
     starts = np.flatnonzero(np.diff(series, prepend=np.nan))
     ends = np.append(starts[1:], len(series))
@@ -86,7 +86,7 @@ def changes(series: np.ndarray, repeat: int = REPEAT) -> np.ndarray:
 
 
 class Excite(Node):
-    """The node. Ends itself (`done`) after the signal."""
+    """The node. It ends (`done`) after the signal."""
 
     def __init__(self) -> None:
         super().__init__("excite", automatically_declare_parameters_from_overrides=True)
@@ -138,7 +138,7 @@ class Excite(Node):
         return self._wait(self._now, "use_sim_time is set: waiting for /clock", end)
 
     def _wait(self, condition: Callable[[], Any], message: str, end: threading.Event) -> bool:
-        """Wait for a condition, saying so every few seconds. False when it is time to stop."""
+        """Wait for a condition and log `message` every few seconds. False if the node is to stop."""
         patience = time.monotonic() + 1.0
         while not condition():
             if end.wait(0.05):
@@ -169,11 +169,11 @@ class Excite(Node):
             progress.show(x.duration)
 
     def _now(self) -> int:
-        """The node's time in ns; in real time a clock that nobody can set."""
+        """[ns] The node's time; in real time the monotonic clock, which cannot be set."""
         return int(self._clock.now().nanoseconds) if self._simulated else time.monotonic_ns()
 
     def _sleep_until(self, sample: int, end: threading.Event) -> bool:
-        """Sleep until this sample of the signal is due. False when it is time to stop."""
+        """Sleep until the time of this sample. False if the node is to stop."""
         while not end.is_set():
             self._clock_ticked.clear()
             now = self._now()
@@ -189,7 +189,7 @@ class Excite(Node):
         return False
 
     def _rest(self) -> None:
-        """Send duty 0 ten times over 0.2 s: confirmation by the middleware would take up to 3 s (its heartbeat)."""
+        """Send duty 0 ten times in 0.2 s. A confirmation by the middleware would take up to 3 s (its heartbeat)."""
         for _ in range(10):
             self._publisher.publish(Float64(data=0.0))
             time.sleep(0.02)
@@ -206,12 +206,12 @@ class Excite(Node):
 
 
 class ProgressShow:
-    """Shows how far something is: a bar on a terminal, else a line every few seconds.
+    """Shows progress: a bar on a terminal, else a line every few seconds.
 
     Args:
-        label: what it is.
-        total_s: length, s.
-        log: takes a line.
+        label: name of the task.
+        total_s: [s] length of the task.
+        log: gets each line.
     """
 
     def __init__(self, label: str, total_s: float, log: Callable[[str], Any]) -> None:
@@ -237,7 +237,7 @@ class ProgressShow:
         self._bar.stop()
 
     def show(self, done_s: float) -> None:
-        """Show that this many seconds are done, s."""
+        """Show the time [s] that is done."""
         self._bar.update(self._task, completed=done_s)
         if self._bar.disable and time.monotonic() > self._due:
             self._due += NEWS_S

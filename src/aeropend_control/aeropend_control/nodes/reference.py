@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command that gives a controller a reference: waits until somebody listens, sends it, and ends."""
+"""Command that sends a reference to a controller: it waits for a subscriber, sends the reference, and ends."""
 
 from __future__ import annotations
 
@@ -18,26 +18,27 @@ from aeropend_sim.ros.usage import usage
 from aeropend_sim.ros.worker import Worker, wait_until
 
 REPEATS, REPEAT_S = 10, 0.02
-"""How often the reference is sent, and s in between: confirmation by the middleware would take up to 3 s."""
+"""Number of times that the reference is sent, and [s] time between them. A confirmation by the middleware would take
+up to 3 s (its heartbeat)."""
 NEWS_S = 3.0
-"""s after which it says that nobody listens."""
+"""[s] Time after which a message reports that there is no subscriber (choice)."""
 
 USAGE = usage(
-    "reference: gives a controller its reference, and ends. Rad from hanging; for cascade the rotor's speed in rad/s.",
+    "reference: sends a reference to a controller, and ends. Angle in rad from hanging; for cascade speed in rad/s.",
     {},
     [
         "reference VALUE [--ros-args ...]",
         "reference 0.4",
         "reference 0.4 --ros-args -r __ns:=/rig1",
     ],
-    "It waits for a controller, which refuses what is out of its range, says so, and keeps the reference it had.\n"
+    "It waits for a controller. A controller refuses a value out of its range, reports that, and keeps the old one.\n"
     "ros2 topic pub --once /reference std_msgs/msg/Float64 '{data: 0.4}' does the same.",
     "VALUE",
 )
 
 
 class Reference(Node):
-    """Sends one value until it surely has been heard."""
+    """The node. It sends one value several times and ends."""
 
     def __init__(self, value: float) -> None:
         super().__init__("reference")
@@ -51,33 +52,36 @@ class Reference(Node):
         self._worker.stop()
 
     def _send(self, end: threading.Event) -> None:
-        start, said = time.monotonic(), False
+        start, reported = time.monotonic(), False
 
-        def heard() -> bool:
-            nonlocal said
-            if not said and time.monotonic() > start + NEWS_S:
-                said = True
+        def has_subscriber() -> bool:
+            nonlocal reported
+            if not reported and time.monotonic() > start + NEWS_S:
+                reported = True
                 self.get_logger().info(f"nobody listens to {self._publisher.topic_name} yet: waiting for a controller")
             return bool(self._publisher.get_subscription_count())
 
-        if wait_until(heard, end):
+        if wait_until(has_subscriber, end):
             for _ in range(REPEATS):
                 self._publisher.publish(Float64(data=self._value))
                 time.sleep(REPEAT_S)
 
 
 def value_of(words: Sequence[str]) -> float:
-    """The reference that the arguments give.
+    """The reference on the command line.
+
+    Args:
+        words: the arguments without those for ROS.
 
     Raises:
-        UserError: none, more than one, or not a number.
+        UserError: no argument, more than one, or not a number.
     """
     if len(words) != 1:
         raise UserError(f"give one number, not {' '.join(words) or 'none'}: reference 0.4 (see --help)")
     try:
         return float(words[0])
     except ValueError:
-        raise UserError(f"'{words[0]}' is no number: reference 0.4 (see --help)") from None
+        raise UserError(f"'{words[0]}' is not a number: reference 0.4 (see --help)") from None
 
 
 def main(args: Sequence[str] | None = None) -> int:

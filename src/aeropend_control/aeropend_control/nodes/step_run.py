@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps the reference of a controller that runs, and says how the rig answered.
+"""The command `step_test`: it steps the reference of a running controller and describes the step responses.
 
-What the rig reports is kept as it comes off the wire and decoded when the test is over. A reference counts from the
-first sample after it was sent. The last reference sent is 0.
+The messages of the rig are stored as received and decoded after the test. A reference counts from the first sample
+after it was sent. The last reference is 0.
 """
 
 from __future__ import annotations
@@ -38,17 +38,18 @@ from aeropend_sim.ros.usage import EXIT_CODES
 from aeropend_sim.ros.worker import Worker, wait_until
 
 LEVELS = {"theta": (0.2, 0.4, 0.7), "omega": (99.5,)}
-"""What is stepped to, by what is measured; 99.5 rad/s are the thesis' 950 RPM."""
+"""[rad], [rad/s] Default levels, by what is measured (choices); 99.5 rad/s is the thesis' 950 RPM."""
 FILES = ("steps.csv", "steps.json", "steps.svg")
 MATCHED_S = 0.5
-"""s from knowing a controller until it surely knows us."""
+"""[s] Time for the controller to discover this node (choice)."""
 NAMES_S = 5.0
-"""s that the names of those who listen may take."""
+"""[s] Longest wait for the node names of the subscribers (choice)."""
 SILENT_S = 2.0
-"""s without a sample, of wall time, after which the test is given up."""
+"""[s] Wall time without a sample after which the test is aborted (choice)."""
 NEWS_S = 5.0
+"""[s] Time between messages while waiting (choice)."""
 REPEATS, REPEAT_S = 3, 0.01
-"""How often a reference is sent, and s in between."""
+"""Number of times that a reference is sent, and [s] time between them (choices)."""
 
 EXAMPLES = f"""\
 examples, with a plant or bridge and a controller running:
@@ -56,25 +57,26 @@ examples, with a plant or bridge and a controller running:
   step_test --levels 0.1 0.3 0.1 --hold 4 --out my_steps
   step_test --ros-args -r __ns:=/rig1
 
-DIR gets steps.csv (the samples), steps.json (the figures) and steps.svg (a drawing). For a bag of the same, start
-`record my_bag --ros-args -p while_published:=reference` first; `step_response my_bag` makes the table of it.
+It writes steps.csv (the samples), steps.json (the figures) and steps.svg (a drawing) to DIR. To record a bag of the
+test, first start `record my_bag --ros-args -p while_published:=reference`. `step_response my_bag` prints the table from
+the bag.
 
 {EXIT_CODES}"""
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
-    """Read the command line, without ROS arguments; exits with 2 and one line where it is wrong."""
+    """Read the command line, without ROS arguments; exits with code 2 and one line if it is wrong."""
     parser = Parser(
         prog="step_test", epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Step a running controller's reference, and print t_r, t_p, t_s, M_p and the steady-state error "
-                    "beside what they may be at most (Table 6.1 of the thesis).")
+                    "with their limits (Table 6.1 of the thesis).")
     parser.add_argument("--levels", nargs="+", type=float, metavar="LEVEL",
-                        help="what to step to, rad (rad/s for cascade); default 0.2 0.4 0.7; for cascade 99.5")
+                        help="values of the reference, rad (rad/s for cascade); default 0.2 0.4 0.7; for cascade 99.5")
     parser.add_argument("--hold", type=float, default=5.0, metavar="S", help="time at each level, default 5 s")
-    parser.add_argument("--law", choices=LAWS, help="which controller runs; default: the one that listens")
+    parser.add_argument("--law", choices=LAWS, help="the running controller; default: the subscriber of reference")
     parser.add_argument("--out", type=Path, metavar="DIR",
-                        help="folder for the results; default: a new one, named after the time")
-    parser.add_argument("--overwrite", action="store_true", help="replace results that are in DIR")
+                        help="folder for the results; default: a new one, named after date and time")
+    parser.add_argument("--overwrite", action="store_true", help="replace existing results in DIR")
     options = parser.parse_args(arguments)
     if not 0.5 <= options.hold <= 600.0:
         parser.error(f"--hold {options.hold:g}: give 0.5 to 600 s")
@@ -92,10 +94,10 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 class StepTest(Node):
-    """The node. Ends itself (`done`) after the steps.
+    """The node. It ends (`done`) after the steps.
 
     Attributes:
-        outcome: what to print when all went well.
+        outcome: prints the results; None if the test did not finish.
     """
 
     def __init__(self, options: argparse.Namespace) -> None:
@@ -105,7 +107,7 @@ class StepTest(Node):
         self._joints: list[bytes] = []
         self._armatures: list[bytes] = []
         self._heard = time.monotonic()
-        self._steps: list[tuple[int, float]] = []  # stamp of the last sample before, and the reference
+        self._steps: list[tuple[int, float]] = []  # stamp [ns] of the last sample before, and the reference
         qos = interface.QOS
         self._publisher = self.create_publisher(Float64, interface.REFERENCE, qos)
         self.create_subscription(JointState, interface.JOINT_STATES, self._on_joint_states, qos, raw=True)
@@ -138,11 +140,11 @@ class StepTest(Node):
                                f"nobody listens to {self._publisher.topic_name} yet: waiting for a controller", end)):
             return
         known = self._known_laws
-        give_up = time.monotonic() + NAMES_S  # a node's name may come later than its subscription
+        give_up = time.monotonic() + NAMES_S  # a node's name may be known later than its subscription
         wait_until(lambda: len(known()) == 1 or time.monotonic() > give_up or bool(options.law), end)
         if not options.law and len(known()) != 1:
-            raise UserError(f"{' and '.join(known()) or 'no law that is known here'} listens to "
-                            f"{self._publisher.topic_name}: say --law")
+            raise UserError(f"{' and '.join(known()) or 'no known law'} listens to "
+                            f"{self._publisher.topic_name}: give --law")
         law = options.law or known()[0]
         kind = LAWS[law]
         low, high = kind.reference_limits
@@ -164,7 +166,7 @@ class StepTest(Node):
         self._finish(law, joints, armatures)
 
     def _wait(self, condition: Callable[[], Any], message: str, end: threading.Event) -> bool:
-        """Wait for a condition, saying so every few seconds. False when it is time to stop."""
+        """Wait for a condition and log `message` every few seconds. False if the node is to stop."""
         patience = time.monotonic() + 1.0
 
         def met() -> bool:
@@ -177,19 +179,19 @@ class StepTest(Node):
         return wait_until(met, end)
 
     def _known_laws(self) -> list[str]:
-        """The laws that listen to the reference, by the names of their nodes."""
+        """The laws that subscribe to the reference, by the names of their nodes."""
         listeners = self.get_subscriptions_info_by_topic(self._publisher.topic_name)
         return sorted({info.node_name for info in listeners} & LAWS.keys())
 
     def _step(self, level: float) -> None:
-        """Send a reference; it counts from the next sample."""
+        """Send a reference, which counts from the next sample."""
         self._steps.append((wire.stamp_ns(self._joints[-1]), level))
         for _ in range(REPEATS):
             self._publisher.publish(Float64(data=level))
             time.sleep(REPEAT_S)
 
     def _hold(self, seconds: float, before: float, progress: ProgressShow, end: threading.Event) -> bool:
-        """Wait until the samples are this much older than the step. False when it is time to stop."""
+        """Wait until the last sample is `seconds` [s] after the step. False if the node is to stop."""
         start, _ = self._steps[-1]
         while (passed := 1e-9 * (wire.stamp_ns(self._joints[-1]) - start)) < seconds:
             if end.wait(0.05):
@@ -202,7 +204,7 @@ class StepTest(Node):
         return True
 
     def _finish(self, law: str, joints: Sequence[bytes], armatures: Sequence[bytes]) -> None:
-        """Decode, describe and write."""
+        """Decode the messages, describe the responses and write the results."""
         kind = LAWS[law]
         # without the reference that ends the test: stamps of a real clock may lie a little off the grid, after it
         references = self._steps[:-1]
@@ -211,26 +213,32 @@ class StepTest(Node):
             time_, columns, lost = _columns(joints, armatures, references, end)
             y = columns[kind.measures]
             if not np.isfinite(y).all():
-                raise UserError(f"{interface.JOINT_STATES} holds no {kind.measures}: nothing to describe")
+                raise UserError(f"{interface.JOINT_STATES} holds no {kind.measures}: there is no response")
             described = step_responses(time_, y, columns["reference"])
         except StepError as error:
             raise UserError(str(error)) from error
         write(self._options.out, law, time_, columns, described)
 
-        def tell(console: Console) -> None:
+        def show(console: Console) -> None:
             console.print(step_report.table({law: described}, {law: kind.reference_unit}))
             note = f"{lost} of {len(time_)} samples lost; " if lost else ""
             console.print(f"{note}{self._options.out}: {', '.join(FILES)}", soft_wrap=True)
 
-        self.outcome = tell
+        self.outcome = show
 
 
 def _columns(joints: Sequence[bytes], armatures: Sequence[bytes], references: Sequence[tuple[int, float]], end: int
              ) -> tuple[step_report.Array, dict[str, step_report.Array], int]:
-    """Decode and join what came after the first reference, up to `end` (ns).
+    """Decode and join the messages after the first reference.
+
+    Args:
+        joints: serialized `joint_states`.
+        armatures: serialized `armature`.
+        references: stamp [ns] of the last sample before each reference, and the reference.
+        end: [ns] stamp of the last sample that is used.
 
     Returns:
-        Time (M,), columns (M,), and how many samples were missing.
+        Time [s] (M,), columns (M,), and the number of missing samples.
     """
     first = references[0][0]
     rows: dict[int, list[float]] = {}
@@ -255,7 +263,14 @@ def _columns(joints: Sequence[bytes], armatures: Sequence[bytes], references: Se
 
 def write(out: Path, law: str, time_: step_report.Array, columns: dict[str, step_report.Array],
           described: Sequence[StepResponse]) -> None:
-    """Write all files.
+    """Write the files of a step test.
+
+    Args:
+        out: folder of the results.
+        law: name of the law.
+        time_: [s] (M,).
+        columns: (M,) each.
+        described: the step responses.
 
     Raises:
         UserError: the folder cannot be made or written.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands between a control law and the rig: samples in order, references in range, and duty 0 when in doubt."""
+"""Supervision of a control law: samples in order, references in range, and duty 0 after a fault."""
 
 from __future__ import annotations
 
@@ -12,39 +12,39 @@ from aeropend_sim.model.parameters import SAMPLE_PERIOD
 from aeropend_sim.model.rig import Sample
 
 LOST = Sample(math.nan, math.nan, math.nan, math.nan)
-"""What a law is given for a sample that never came."""
+"""The sample that a law gets for a lost one."""
 
 LEAST_DUTY = 0.01
-"""A rig that applies none of a duty below this may have rounded it to 0."""
+"""Least commanded duty at which an applied duty of 0 is a fault: a rig may round smaller duties to 0 (choice)."""
 
 
 class Supervisor:
-    """Feeds a law and decides whether its duty goes out.
+    """Passes samples to a law and decides whether its duty is sent.
 
-    A law that has been out of control of the rig for longer than `timeout` starts anew, since neither its memory of
-    the arm nor its integral mean anything by then; what is shorter it bridges by its own prediction.
+    The law restarts if it did not control the rig for longer than `timeout`, because its state and its integral are
+    then no longer valid. It bridges shorter gaps by prediction.
 
     Attributes:
-        reference: what the law is asked for; NaN before the first.
-        duty: the last one sent.
-        fault: why the duty is 0, or has no effect, in one line; "" while all is well.
-        refusal: why the last reference was refused; "" when it was not.
-        counts: how often each kind of fault began, and `samples`, `lost`, `repeated`, `refused`.
+        reference: current reference; NaN before the first.
+        duty: the last duty sent.
+        fault: why the duty is 0 or has no effect, in one line; "" without a fault.
+        refusal: why the last reference was refused; "" if it was accepted.
+        counts: number of faults of each kind, and of `samples`, `lost`, `repeated` and `refused`.
     """
 
     def __init__(self, law: Law, *, angle_limit: float, low: float, high: float, unit: str = "rad",
                  measures: Iterable[str] = ("theta",), period: float = SAMPLE_PERIOD, timeout: float = 0.05) -> None:
-        """Take a law in its care.
+        """Prepare the supervision of a law; the law is reset.
 
         Args:
             law: gets one sample after the other.
-            angle_limit: rad; an arm further up than this, to either side, is let down.
+            angle_limit: [rad] beyond this angle, to either side, the duty is 0.
             low: least reference.
             high: greatest reference.
-            unit: of both, for people.
-            measures: the readings, by the names of `Sample`, that the law cannot do without.
-            period: of the samples, s.
-            timeout: s without a reading, or without effect on the rig, after which the law starts anew.
+            unit: of the references, for messages.
+            measures: the readings, fields of `Sample`, that the law needs.
+            period: [s] between samples.
+            timeout: [s] without a reading, or without effect on the rig, after which the law restarts.
         """
         self.law, self.angle_limit, self.low, self.high, self.unit = law, angle_limit, low, high, unit
         self.period, self.timeout = period, timeout
@@ -54,14 +54,14 @@ class Supervisor:
         self._fault_kind = ""
         self._stamp: int | None = None
         self._applied = 0.0
-        self._unusable = 0  # samples in a row that could not be used
-        self._without_effect = 0  # samples in a row to which the rig had applied nothing of a duty
+        self._unusable = 0  # number of unusable samples in a row
+        self._without_effect = 0  # number of samples in a row at which the rig applied duty 0 instead of the command
         self._tripped = False
         self.law.reset()
 
     def set_reference(self, reference: float) -> bool:
-        """Take a new reference; False when it is refused, which leaves the one before."""
-        if not self.low <= reference <= self.high:  # NaN neither
+        """Set a new reference. Returns False if it is refused; then the previous one stays."""
+        if not self.low <= reference <= self.high:  # false for NaN too
             self.refusal = f"reference {reference:g} refused: give {self.low:g} to {self.high:g} {self.unit}"
             self.counts["refused"] += 1
             return False
@@ -71,7 +71,7 @@ class Supervisor:
         return True
 
     def note_applied(self, duty: float) -> None:
-        """Note what the rig says it applies; called for each sample that says so."""
+        """Process the duty [0..1] that the rig reports as applied; call it for each sample that reports one."""
         self._applied = duty if math.isfinite(duty) else 0.0
         if duty > 0.0:
             self._without_effect = 0
@@ -79,17 +79,20 @@ class Supervisor:
             self._without_effect += 1
 
     def on_timeout(self) -> None:
-        """Note that no sample has come for `timeout`: the duty is 0, and the law starts anew."""
+        """Handle the absence of samples for `timeout`: the duty is 0, and the law restarts."""
         self.duty, self._unusable, self._without_effect = 0.0, 0, 0
         self.law.reset()
         self._set_fault("silent", f"no sample for {self.timeout:g} s: duty 0")
 
     def step(self, stamp_ns: int, sample: Sample) -> float | None:
-        """Take a sample and return the duty to send; None for a sample that was there before.
+        """Process a sample.
 
         Args:
-            stamp_ns: instant of sampling, ns.
-            sample: NaN where there is no reading.
+            stamp_ns: [ns] time of sampling.
+            sample: the readings; NaN where a reading is missing.
+
+        Returns:
+            [0..1] The duty to send; None for a repeated sample.
         """
         if not self._is_new(stamp_ns):
             return None
@@ -98,16 +101,16 @@ class Supervisor:
         return self.duty
 
     def _is_new(self, stamp_ns: int) -> bool:
-        """Whether this sample is news; the law is told of those lost before it."""
+        """Whether this sample is new. The law gets `LOST` for each sample lost before it."""
         before, self._stamp = self._stamp, stamp_ns
         if before is None:
             return True
         passed = 1e-9 * (stamp_ns - before)
         if 0.5 * self.period < passed < 1.5 * self.period:
             return True
-        if abs(passed) > self.timeout:  # a gap, or time was set
+        if abs(passed) > self.timeout:  # a gap, or the clock was set
             self.counts["lost"] += max(0, round(passed / self.period) - 1)
-            self.law.reset(None, self._applied)  # which the rig has held meanwhile
+            self.law.reset(None, self._applied)  # the duty that the rig held in the gap
             return True
         if passed < 0.5 * self.period:
             self.counts["repeated"] += 1
@@ -120,6 +123,7 @@ class Supervisor:
         return True
 
     def _duty_for(self, sample: Sample) -> float:
+        """Duty for a new sample; 0 and a fault if the law cannot or must not act."""
         missing = [Sample._fields[at] for at in self._measures if not math.isfinite(sample[at])]
         if missing:
             self._set_fault("unusable", f"{' and '.join(missing)} of a sample is NaN: duty 0")

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of the loop as they are on the wire (CDR), without rclpy's conversions, which cost a third of it."""
+"""Serialization (CDR) of the three messages of the control loop.
+
+It replaces the conversions of rclpy, which take a third of the time of a control step.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +16,11 @@ _FLOAT64 = struct.Struct("<4xd")
 _S = 1_000_000_000
 
 MALFORMED = (struct.error, ValueError, IndexError)
-"""What reading raises when a message is none: anybody may send anything."""
+"""Exceptions of the reading functions for a malformed message."""
 
 
 class Joints(NamedTuple):
-    """A `sensor_msgs/msg/JointState`: stamp in ns, and by joint position and velocity."""
+    """Contents of a `sensor_msgs/msg/JointState`: stamp [ns], and position and velocity by joint [SI]."""
 
     stamp_ns: int
     position: dict[str, float]
@@ -25,7 +28,7 @@ class Joints(NamedTuple):
 
 
 class Armature(NamedTuple):
-    """What counts of a `sensor_msgs/msg/BatteryState`: stamp in ns, A, V, and the duty applied."""
+    """Used fields of a `sensor_msgs/msg/BatteryState`: stamp [ns], current [A], voltage [V], applied duty [0..1]."""
 
     stamp_ns: int
     i_a: float
@@ -76,7 +79,7 @@ def armature(message: bytes) -> Armature:
 
 
 def stamp_ns(message: bytes) -> int:
-    """The stamp of a serialized message that begins with a header, ns."""
+    """[ns] Stamp of a serialized message that begins with a header."""
     seconds, nanoseconds, _ = _HEAD[_order(message)].unpack_from(message, 4)
     return int(seconds) * _S + int(nanoseconds)
 
