@@ -9,6 +9,7 @@ The field `closure` is the key "shrink", `basis` the key "from"; all other keys 
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -196,6 +197,19 @@ class NextExperiment:
 
     why: str
     excite: Mapping[str, Setting]
+
+    @property
+    def command(self) -> str:
+        """The command that runs it; "" if there is none."""
+        settings = [f"-p {shlex.quote(f'{name}:={_ros_text(value)}')}" for name, value in self.excite.items()]
+        return " ".join(["excite --ros-args", *settings]) if settings else ""
+
+
+def _ros_text(value: Setting) -> str:
+    """A value as a ROS parameter on the command line."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"[{', '.join(map(_ros_text, value))}]" if isinstance(value, tuple) else str(value)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,9 +21,9 @@ from aeropend_ident.diagnosis.document import (
     to_json,
 )
 from aeropend_ident.diagnosis.report import page
+from aeropend_ident.diagnosis.report.candidates import unit_of
 from aeropend_ident.result_folder import check, whole
-from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
-from aeropend_sim.model.parameters import PARAMETERS, Model, save
+from aeropend_sim.model.parameters import Model, save
 from aeropend_sim.untrusted import printable
 
 FILES = ("diagnosis.json", "report.html", "augmented.yaml")
@@ -171,19 +170,11 @@ def _percent(share: float) -> int:
 
 
 def experiment(advice: NextExperiment) -> str:
-    """The advised experiment as a command."""
-    settings = {k: list(v) if isinstance(v, tuple) else v for k, v in advice.excite.items()}
-    command = "excite --ros-args " + " ".join(f"-p {shlex.quote(f'{k}:={v}')}" for k, v in settings.items())
-    return f"{command} ({advice.why})" if settings else advice.why
+    """The advised experiment as a command, with the reason."""
+    return f"{advice.command} ({advice.why})" if advice.command else advice.why
 
 
 def describe(candidate: Candidate) -> str:
     """A candidate's parameters with units and 95 % intervals."""
-    texts = []
-    for name, p in candidate.parameters.items():
-        if candidate.effect == PARAMETER_MISMATCH:
-            unit = PARAMETERS[f"model.{name}"].unit
-        else:
-            unit = CATALOGUE[candidate.effect].parameters[name].unit
-        texts.append(f"{name} = {p.value:.4g} ({p.low:.4g} to {p.high:.4g}) {unit}")
-    return ", ".join(texts)
+    return ", ".join(f"{name} = {p.value:.4g} ({p.low:.4g} to {p.high:.4g}) {unit_of(candidate.effect, name)}"
+                     for name, p in candidate.parameters.items())

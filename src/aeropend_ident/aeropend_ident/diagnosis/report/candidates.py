@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass
 
 from aeropend_ident.diagnosis.document import Candidate, DiagnosisDocument, NextExperiment
@@ -55,14 +54,6 @@ class CandidateRow:
 
 
 @dataclass(frozen=True)
-class Advice:
-    """The next experiment: the reason, and the command ("" if there is none)."""
-
-    why: str
-    command: str
-
-
-@dataclass(frozen=True)
 class Candidates:
     """The content of the section.
 
@@ -76,7 +67,19 @@ class Candidates:
     shown: list[CandidateRow]
     others: list[CandidateRow]
     not_separable: tuple[tuple[str, str], ...]
-    advice: Advice | None
+    advice: NextExperiment | None
+
+
+def unit_of(effect: str, parameter: str) -> str:
+    """Unit of a parameter of a candidate; "-" for none.
+
+    Args:
+        effect: id of the effect, or "parameter_mismatch".
+        parameter: of the effect, or of the model.
+    """
+    if effect == PARAMETER_MISMATCH:
+        return PARAMETERS[f"model.{parameter}"].unit
+    return CATALOGUE[effect].parameters[parameter].unit
 
 
 def rows(document: DiagnosisDocument) -> list[CandidateRow]:
@@ -92,9 +95,8 @@ def section(document: DiagnosisDocument, candidates: list[CandidateRow]) -> Cand
         candidates: all rows.
     """
     shown = [c for c in candidates if c.found or c.probability >= PROBABLE]
-    which = document.which
-    return Candidates(shown, [c for c in candidates if c not in shown], which.not_separable,
-                      None if which.next_experiment is None else _advice(which.next_experiment))
+    others = [c for c in candidates if c not in shown]
+    return Candidates(shown, others, document.which.not_separable, document.which.next_experiment)
 
 
 def _row(c: Candidate) -> CandidateRow:
@@ -102,20 +104,7 @@ def _row(c: Candidate) -> CandidateRow:
     estimates = []
     for name, q in c.parameters.items():
         value, between = interval(q.value, q.low, q.high)
-        unit = PARAMETERS[f"model.{name}"].unit if parameter else CATALOGUE[c.effect].parameters[name].unit
-        estimates.append(Estimate(name, with_unit(value, unit), between))
+        estimates.append(Estimate(name, with_unit(value, unit_of(c.effect, name)), between))
     physics = minus(f"{PARAMETERS[f'model.{parameter}'].description}; its value is off" if parameter
                     else CATALOGUE[c.effect].physics)
     return CandidateRow(c.effect, parameter, c.place, physics, c.probability, estimates, c.gap_after, c.found)
-
-
-def _advice(experiment: NextExperiment) -> Advice:
-    settings = [f"-p {shlex.quote(f'{name}:={_ros(value)}')}" for name, value in experiment.excite.items()]
-    return Advice(experiment.why, " ".join(["excite --ros-args", *settings]) if settings else "")
-
-
-def _ros(value: object) -> str:
-    """A value as a ROS parameter on the command line."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f"[{', '.join(map(_ros, value))}]" if isinstance(value, tuple) else str(value)

@@ -16,6 +16,7 @@ from aeropend_ident.diagnosis.report.binned import variable
 from aeropend_ident.diagnosis.report.drawing import HEIGHT, WIDTH, from_top, grid
 from aeropend_ident.diagnosis.report.number_format import Tick, quantity, ticks, with_unit
 from aeropend_ident.diagnosis.report.variables import VARIABLES, Variable
+from aeropend_ident.signals.statistics import rms
 
 Array = NDArray[np.float64]
 
@@ -163,8 +164,9 @@ def draw(unknown: UnknownEffect, factors: Factors, fitted: float) -> Unknown | N
 
 
 def _rms(x: Array) -> float:
-    x = x[np.isfinite(x)]
-    return float(np.sqrt(np.mean(x**2))) if len(x) else 0.0
+    """Root mean square of the known values of x (N,)."""
+    known = x[np.isfinite(x)]
+    return rms(known) if len(known) else 0.0
 
 
 def _rows(curves: Sequence[Curve]) -> list[tuple[str, str, Array, Array]]:

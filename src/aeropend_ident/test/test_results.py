@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The lines that a diagnosis prints."""
+
+import pytest
+
+from aeropend_ident.diagnosis.document import (
+    Candidate,
+    ClosedGap,
+    HangingAngle,
+    Identified,
+    Interval,
+    Lift,
+    NextExperiment,
+    ParameterRow,
+)
+from aeropend_ident.diagnosis.results import describe, experiment, gap_line, identified_line
+
+
+@pytest.mark.parametrize(("closed", "low", "high", "text"), [
+    (0.876, 0.851, 0.9, "88 % (85 to 90 %) of the gap above the floor is closed"),
+    (1.0, None, None, "100 % of the gap above the floor is closed"),
+    (-0.001, -0.004, 0.004, "0 % (0 to 0 %) of the gap above the floor is closed"),
+    (None, None, None, "nothing to close"),
+])
+def test_the_line_of_a_gap(closed, low, high, text):
+    start = "gap: 12.5 % of the signals' spread, 2.0 % with the augmented model, floor 1.0 %: "
+    assert gap_line("gap", ClosedGap(0.125, 0.02, 0.01, closed, low, high)) == start + text
+
+
+def test_the_parameters_of_a_candidate_have_units():
+    friction = Candidate("coulomb_friction", "arm", 0.99, {"accel": Interval(0.8, 0.75, 0.85)}, True, 0.1)
+    assert describe(friction) == "accel = 0.8 (0.75 to 0.85) rad/s²"
+    off = Candidate("parameter_mismatch", "electrical", 0.99, {"R_a": Interval(1.5, 1.4, 1.6)}, True, 0.1)
+    assert describe(off) == "R_a = 1.5 (1.4 to 1.6) Ω"
+
+
+def test_an_experiment_is_a_command_that_a_shell_understands():
+    settings = {"kind": "steps", "on": True, "duration": 60.0, "sequence": (0.0, 0.2)}
+    assert experiment(NextExperiment("it separates them", settings)) == (
+        "excite --ros-args -p kind:=steps -p on:=true -p duration:=60.0 -p 'sequence:=[0.0, 0.2]' (it separates them)")
+    assert experiment(NextExperiment("measure R_a directly", {})) == "measure R_a directly"
+
+
+def test_the_line_of_an_uncalibrated_rig():
+    rows = {"R_a": ParameterRow(1.0, 1.1, 1.0, 1.2, determined=False),
+            "c_over_J": ParameterRow(1.0, 1.5, 1.4, 1.6, determined=True, runs=(), run_to_run=0.25)}
+    lift = Lift((0.0, 0.9), (0.0, 20.0), 0.1, 0.3)
+    assert identified_line(Identified("the angle", ("R_a",), lift, HangingAngle(0.1, 0.0, 0.2)), rows) == (
+        "identified from the angle: c_over_J = 1.5 (1.4 to 1.6, run to run 0.25), hangs at 0.1 rad, lift up to 20 "
+        "rad/s² at a duty of 0.90, none below 0.1, with a lag of 0.3 s; not determined: R_a")
+    assert identified_line(Identified("the angle", ()), {}) == "identified from the angle: nothing"
