@@ -22,7 +22,7 @@ def test_a_rich_input_excites_every_term():
 def test_a_single_step_leaves_terms_undetermined(capsys):
     assert main(["--kind", "hold", "--duration", "10"]) == 0
     said = capsys.readouterr().out
-    assert "cannot be told from" in said
+    assert "cannot be distinguished from" in said
     assert "would stay undetermined" in said
 
 

@@ -26,7 +26,7 @@ GEAR = 55.0 / 9.0
 """Gear ratio N1/N2 of the thesis. Its K_q refers to the propeller's side: k_thrust = K_q (55/9)² (3.3, 3.4)."""
 
 SURE = 3.0
-"""Number of standard deviations from which on a deviation is reported. Convention: the three-sigma rule."""
+"""Number of standard deviations above which a deviation is reported. Convention: the three-sigma rule."""
 
 SETTLED = 0.01
 """Change within a plateau, as a share of the channel's range, up to which a reading counts as steady. Choice."""

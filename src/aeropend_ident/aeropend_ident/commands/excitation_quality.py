@@ -43,7 +43,7 @@ SIGNAL = {"duration": "length, s", "duty_min": "least duty", "duty_max": "greate
           "hold_min": "shortest hold, s", "hold_max": "longest hold, s", "rest": "duty 0 between the holds, s"}
 
 POOR = 0.1
-"""Relative standard deviation of a coefficient from which on an input excites it poorly. Choice."""
+"""Relative standard deviation of a coefficient at or above which its input excites it poorly. Choice."""
 
 
 @dataclass(frozen=True)
@@ -156,9 +156,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"excitation_quality: {error}", file=sys.stderr)
         return 2
     for one in found:
-        said = f"cannot be told from {', '.join(one.rivals)}" if one.rivals else ("poorly excited" if one.poor else "")
+        remark = "poorly excited" if one.poor else ""
+        if one.rivals:
+            remark = f"cannot be distinguished from {', '.join(one.rivals)}"
         known = f"known to {100.0 * one.sigma / abs(one.value):8.3g} %"
-        print(f"d({one.equation})/dt  {one.term:18} {one.value:12.6g}  {known}  {said}".rstrip())
+        print(f"d({one.equation})/dt  {one.term:18} {one.value:12.6g}  {known}  {remark}".rstrip())
     poor = sum(one.poor for one in found)
     print(f"{poor} of {len(found)} terms would stay undetermined" if poor else "every term is excited")
     return 0

@@ -20,7 +20,7 @@ from aeropend_ident.signals.statistics import effective_sample_size
 DERIVATIVES = ("smoothed", "tv")
 
 MOST_DISTURBED = 0.7
-"""Share of samples near steps of an input from which on they are used as well. Choice: otherwise few remain."""
+"""Share of samples near steps of an input above which these are used as well. Choice: otherwise few remain."""
 
 
 class BlockRegression(Protocol):

@@ -41,7 +41,7 @@ BLOCKS = 24
 """Number of blocks of rows. Choice."""
 
 ABOVE_NOISE = 3.0
-"""Power of a signal over that of its noise from which on it exceeds the noise. Choice."""
+"""Ratio of a signal's power to that of its noise above which it exceeds the noise. Choice."""
 
 NOISE_BAND = 0.7
 """Share of the spectrum above which it is noise. Choice."""

@@ -119,8 +119,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             show(number, method)
             found_by[method] = study(method, options.noise, options.seed)
     for method, found in found_by.items():
-        said = "the true terms" if is_exact(found.equations, truth(method)) else "not the true terms"
-        print(f"{method}: {said}, {found.seconds:.1f} s")
+        result = "the true terms" if is_exact(found.equations, truth(method)) else "not the true terms"
+        print(f"{method}: {result}, {found.seconds:.1f} s")
         for s, equation in found.equations.items():
             shown = "  ".join(f"{t} {c:.6g} ± {found.sigma[s][t]:.1g}" for t, c in equation.items())
             print(f"  {s}: {shown or 'nothing'}")

@@ -176,8 +176,8 @@ def chapter_4() -> Iterator[tuple[str, str, str, str]]:
                                       numbers)
     k = thrust.numbers["k_thrust"]
     within = float(np.ptp(thrust.panels[0].y / w**2)) / 2.0 / k.value
-    said = f"of the simulation model; (4.4) over Table 4.2's speeds is f = {k.value:.4g} ω², {100.0 * within:.2g} %"
-    yield "K_q, Table 4.3", "1e-4", f"{k.value / GEAR**2:.4g} N s²", said
+    remark = f"of the simulation model; (4.4) over Table 4.2's speeds is f = {k.value:.4g} ω², {100.0 * within:.2g} %"
+    yield "K_q, Table 4.3", "1e-4", f"{k.value / GEAR**2:.4g} N s²", remark
 
 
 def _one(e: Estimate) -> str:
@@ -285,13 +285,13 @@ def chapter_5(figure: str, seed: int = 0) -> Iterator[str]:
     found = here(figure, seed)
     true = missing() if figure in DISCREPANCY else in_library(load("bench" if figure == "5.17" else "thesis"))
     yield f"Fig {figure}, {what}"
-    yield f"  {'':24}{'true':>14}{'printed':>14}{'its way':>14}{'identify':>14}{'1 sigma':>10}"
+    yield f"  {'':24}{'true':>14}{'printed':>14}{'re-run':>14}{'identify':>14}{'1 sigma':>10}"
     for s in STATES:
         for term in dict.fromkeys([*true[s], *printed[s]]):
-            told = "" if term not in printed[s] else f"{printed[s][term]:.6g}"
+            value = "" if term not in printed[s] else f"{printed[s][term]:.6g}"
             own = "" if peer is None else f"{peer[STATES.index(s), LIBRARY.names.index(term)]:.6g}"
             got, sd = found.equations[s].get(term, 0.0), found.sigma[s].get(term, 0.0)
-            yield (f"  d({s})/dt: {term:{22 - len(s) - 6}}{true[s].get(term, 0.0):14.6g}{told:>14}{own:>14}{got:14.6g}"
+            yield (f"  d({s})/dt: {term:{22 - len(s) - 6}}{true[s].get(term, 0.0):14.6g}{value:>14}{own:>14}{got:14.6g}"
                    f"{sd:10.2g}")
     spurious = sum(t not in true[s] for s in STATES for t in found.equations[s])
     theirs = "" if peer is None else str(int(sum(peer[k, j] != 0.0 for k, s in enumerate(STATES) for j, t in
@@ -309,8 +309,8 @@ def _mse(matrix: Array, figure: str, seed: int) -> float:
     x, v = states(seed)
     whole = matrix + (matrix_of(in_library(mismatched())) if figure in DISCREPANCY else 0.0)
     late = slice(round(0.75 * len(x)), None)
-    told = LIBRARY(np.column_stack([x, v])[late]) @ whole[1]
-    return float(np.mean((told - rates(seed)[late, 1]) ** 2))
+    rate = LIBRARY(np.column_stack([x, v])[late]) @ whole[1]
+    return float(np.mean((rate - rates(seed)[late, 1]) ** 2))
 
 
 @interruptible
@@ -339,10 +339,10 @@ exit codes: 0, 2 no such table, 130 interrupted""",
 
 def _chapter_4() -> Iterator[str]:
     yield f"  {'Chapter 4':18}{'printed':38}{'here'}"
-    for name, printed, found, said in chapter_4():
+    for name, printed, found, remark in chapter_4():
         yield f"  {name:18}{printed:38}{found}"
-        if said:
-            yield f"  {'':18}{'':38}{said}"
+        if remark:
+            yield f"  {'':18}{'':38}{remark}"
     yield ""
 
 
