@@ -112,9 +112,9 @@ class _Names(CompileResultCacheImpl):
         return f"{super().get_filename_base(fullname, abiflags)}.{self._hash}"
 
     def prune(self) -> None:
-        """Remove the versions of this function but for the latest ones."""
-        versions: dict[str, list[Path]] = {}
-        named = re.compile(re.escape(self._function) + r"-\d+\.py\w+\.([0-9a-f]{12})\.(?:nbi|\d+\.nbc)")
+        """Remove all versions of this function except the latest ones. Files of numba alone count as one version."""
+        versions: dict[str | None, list[Path]] = {}
+        named = re.compile(re.escape(self._function) + r"-\d+\.py\w+(?:\.([0-9a-f]{12}))?\.(?:nbi|\d+\.nbc)")
         for path in Path(self.locator.get_cache_path()).iterdir():
             if match := named.fullmatch(path.name):
                 versions.setdefault(match[1], []).append(path)

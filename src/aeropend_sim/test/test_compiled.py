@@ -71,6 +71,9 @@ def test_an_edit_of_a_constant_in_another_file_is_noticed(tree):
 
 def test_what_is_unchanged_is_loaded_and_old_versions_do_not_pile_up(tree):
     folder = tree / "__pycache__"
+    write_pair(tree, 1.5, NUMBAS)
+    assert output(tree, PRINT) == "3.0"
+    assert len(cached(folder)) == 1
     for factor in range(2, 4 + VERSIONS):
         write_pair(tree, float(factor))
         assert output(tree, PRINT) == str(2.0 * factor)
