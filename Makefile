@@ -37,7 +37,7 @@ test: .venv/.dev ## build and test with colcon in a temporary folder, then run e
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m "live and not alone" --reruns 2 -rR $(ARGS) || [ $$? = 5 -a -n "$(ARGS)" ]
 	$(BIN)/python -m pytest -m alone --reruns 2 -rR $(ARGS) || [ $$? = 5 -a -n "$(ARGS)" ]
 
-bench: .venv/.dev ## measure speed beside C, scipy, pysindy and rosbags (ARGS=--quick; ARGS=--readme writes the README's table)
+bench: .venv/.dev ## measure speed beside C, scipy, pysindy and rosbags (ARGS=--quick; ARGS=--docs writes docs/results/bench.md)
 	tools/setup compiler
 	tools/setup firmware
 	$(BIN)/python -m evaluation.bench $(ARGS)

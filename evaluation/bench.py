@@ -2,7 +2,8 @@
 """Measure speed, each figure beside its peer in the same run: `make bench`, or `make bench ARGS=--quick`.
 
 Prints a table and writes it as JSON to bench-results/. Ratios are compared with the last full run of the same machine.
-`--readme` measures nothing: it writes the last full run, with what was measured again since, into the README.
+`--docs` measures nothing: it writes the last full run, with the figures measured again since, into
+docs/results/bench.md.
 """
 
 import argparse
@@ -64,10 +65,10 @@ PACKAGES = ("numpy", "numba", "llvmlite", "scipy", "rosbags", "pysindy", "ros-ja
 EXAMPLES = """examples:
   make bench ARGS=--quick
   make bench ARGS="--only plant record"
-  make bench ARGS=--readme             the table of the last full run goes into README.md
+  make bench ARGS=--docs               the table of the last full run goes into docs/results/bench.md
 
 exit codes: 0 every target is met, 1 one is missed or could not be measured, 2 a wrong command line, or no results for
-the README, 3 every target is met but a ratio is over 20 % worse than in the last full run, 130 interrupted"""
+the page, 3 every target is met but a ratio is over 20 % worse than in the last full run, 130 interrupted"""
 
 QUIET = 0.5
 """Load average below which the machine counts as idle."""
@@ -128,11 +129,11 @@ def main(arguments: list[str] | None = None, folder: Path = RESULTS) -> int:
     parser.add_argument("--quick", action="store_true", help="shorter and with fewer repeats: a fifth of the time")
     parser.add_argument("--only", nargs="+", choices=FIGURES, metavar="FIGURE", default=list(FIGURES),
                         help=f"measure only these: {', '.join(FIGURES)}")
-    results.offer_readme(parser)
+    results.offer_page(parser, "bench")
     options = parser.parse_args(arguments)
-    if options.readme is not None:
+    if options.page is not None:
         try:
-            results.show(options.readme, "bench", history.renewed(folder), readme.table)
+            results.show(options.page, "bench", history.renewed(folder), readme.table)
         except ValueError as error:
             parser.error(str(error))
         return 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Results of long runs: on which machine, as JSON in a folder that stays out of git, and as a table in the README."""
+"""Results of long runs: on which machine, as JSON in a folder that stays out of git, and as a table in docs/results."""
 
 import argparse
 import json
@@ -76,21 +76,28 @@ def on_same(document: Document, machine: Mapping[str, object]) -> bool:
 
 
 def marks(target: str) -> tuple[str, str]:
-    """The two lines of the README between which is the table of a `make` target."""
+    """The two lines of a page between which the table of a `make` target stands."""
     return f"<!-- make {target}: begin -->", f"<!-- make {target}: end -->"
 
 
-def offer_readme(parser: argparse.ArgumentParser) -> None:
-    """Let a command line ask for the table of the last full run in place of a new one."""
-    parser.add_argument("--readme", nargs="?", type=Path, const=ROOT / "README.md", metavar="FILE",
-                        help="run nothing, write the table of the last full run into FILE (default: README.md)")
+def offer_page(parser: argparse.ArgumentParser, target: str) -> None:
+    """Let a command line ask for the table of the last full run in place of a new one.
+
+    Args:
+        parser: of the command line.
+        target: "bench" or "soak"; its page is docs/results/<target>.md.
+    """
+    page = ROOT / "docs" / "results" / f"{target}.md"
+    parser.add_argument("--docs", "--readme", nargs="?", type=Path, const=page, metavar="FILE", dest="page",
+                        help="run nothing, write the table of the last full run into FILE "
+                             f"(default: docs/results/{page.name})")
 
 
 def show(file: Path, target: str, document: Document | None, table: Callable[[Document], str]) -> None:
     """Write the table of the last full run of a `make` target into a file that has its marks.
 
     Args:
-        file: a README.
+        file: a page with the marks of the target.
         target: "bench" or "soak".
         document: its results, if there are any.
         table: makes Markdown of them.

@@ -132,7 +132,8 @@ class TestReadme:
 
 
 def test_figures_that_a_document_names_are_measured():
-    texts = [path.read_text(encoding="utf-8") for path in (*HERE.parent.glob("*.md"), *HERE.parent.glob("docs/*.md"))]
+    pages = (*HERE.parent.glob("*.md"), *HERE.parent.glob("docs/**/*.md"))
+    texts = [path.read_text(encoding="utf-8") for path in pages]
     named = {word for text in texts for words in re.findall(r'ARGS="--only ([^"]+)"', text) for word in words.split()}
     assert {"plant", "sparse-rig"} <= named <= bench.FIGURES.keys()
 

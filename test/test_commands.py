@@ -22,7 +22,7 @@ COMMANDS = {entry.name: entry for entry in commands()}
 MODEL = to_flat(load("bench").with_effects({effect.id: {name: p.default for name, p in effect.parameters.items()}
                                             for effect in CATALOGUE.values()}))
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("src/*/README.md")]
+DOCUMENTS = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("src/*/README.md")]
 
 BASH = """
 eval "$({python} -m aeropend_sim.cli.completion)"

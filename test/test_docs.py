@@ -13,9 +13,11 @@ from aeropend_control.laws.registry import LAWS
 from aeropend_control.nodes.controller import settings
 from aeropend_ident.commands import import_table
 from aeropend_ident.identification.discrepancy import in_library
+from aeropend_ident.testing import bags, rigs
+from aeropend_sim import record
 from aeropend_sim.cli.completion import commands
 from aeropend_sim.model.effects import CATALOGUE
-from aeropend_sim.model.parameters import load
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, load
 
 ROOT = Path(__file__).parents[1]
 ROWS = {cells[0].strip(" `"): cells for cells in (line.strip("|").split("|") for line in
@@ -23,8 +25,9 @@ ROWS = {cells[0].strip(" `"): cells for cells in (line.strip("|").split("|") for
 
 
 READMES = [*sorted(ROOT.glob("*.md")), ROOT / "firmware" / "README.md", *sorted(ROOT.glob("src/*/README.md")),
-           *sorted(ROOT.glob("docs/*.md"))]
+           *sorted(ROOT.glob("docs/**/*.md"))]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+GUIDE = {path.stem: path.read_text(encoding="utf-8") for path in ROOT.glob("docs/guide/*.md")}
 PROMISES = (ROOT / "docs" / "promises.md").read_text(encoding="utf-8")
 
 TESTS = {name for path in [*ROOT.glob("src/*/test/test_*.py"), *ROOT.glob("test/**/test_*.py")]
@@ -93,13 +96,28 @@ KEPT = r"`test_|`make |`python |`tools/|not tested: \w|network\.md"
 """What may stand in the second column of the promises."""
 
 
-def test_every_section_of_the_readme_has_its_table_of_promises():
-    assert re.findall("^## .+", PROMISES, re.MULTILINE) == re.findall("^## .+", README, re.MULTILINE)
+def test_the_promises_are_tables_that_name_what_keeps_each():
     for section in PROMISES.split("\n## ")[1:]:
         title, head, rule, *rows = [line for line in section.splitlines() if line]
-        assert (head, rule) == ("| the README says | kept by |", "| --- | --- |"), title
+        assert (head, rule) == ("| promise | kept by |", "| --- | --- |"), title
         kept = [row.rpartition(" | ")[2] for row in rows]
         assert [one for one in kept if not re.search(KEPT, one)] == []
+
+
+def test_the_readme_is_one_page():
+    assert 100 <= len(README.splitlines()) <= 150
+
+
+def test_a_script_in_the_guide_runs(tmp_path, monkeypatch, capsys):
+    """A bag by the name that the script reads."""
+    (script,) = re.findall(r"```python\n(.+?)```", GUIDE["python"], re.DOTALL)
+    duty = rigs.steps(20.0, 11)
+    columns, _ = record(rigs.drawn_rig(11, {"coulomb_friction": {}}), duty, 11)
+    bags.write(tmp_path / "my_bag", {**{c: columns[c] for c in ("theta", "omega", "i_a", "v_a")}, "duty": duty},
+               round(SAMPLE_PERIOD * 1e9))
+    monkeypatch.chdir(tmp_path)
+    exec(compile(script, "python.md", "exec"), {})
+    assert capsys.readouterr().out.startswith("coulomb_friction {'coulomb_friction': {'accel': ")
 
 
 def test_the_readme_has_every_command_at_its_package():
@@ -108,16 +126,16 @@ def test_the_readme_has_every_command_at_its_package():
     assert {name: package for package, holds in rows.items() for name in re.findall(r"`(\w+)`", holds)} == entries
 
 
-def test_laws_references_and_limits_are_those_of_the_readme():
-    told = re.findall(r"^\| `(\w+)` \| (?:PID|the same|speed).*? \| (.+) \|$", README, re.MULTILINE)
+def test_laws_references_and_limits_are_those_of_the_guide():
+    told = re.findall(r"^\| `(\w+)` \| (?:PID|the same|speed).*? \| (.+) \|$", GUIDE["control"], re.MULTILINE)
     assert {law for law, _ in told} == LAWS.keys()
     angle = [kind for kind in LAWS.values() if kind.measures == "theta"]
     assert next(reference for _, reference in told) == "rad from hanging, 0 to 1.2"
     assert [kind.reference_limits for kind in angle] == [(0.0, 1.2)] * 3
     for kind in LAWS.values():
         timeout, limit = (settings(kind)[name].default for name in ("timeout", "angle_limit"))
-        assert f"no sample for {1000.0 * timeout:g} ms (`timeout`)" in README
-        assert f"the arm beyond {limit:g} rad (`angle_limit`)" in README
+        assert f"no sample for {1000.0 * timeout:g} ms (`timeout`)" in GUIDE["control"]
+        assert f"the arm beyond {limit:g} rad (`angle_limit`)" in GUIDE["control"]
 
 
 PIECE = re.compile(r"^    from aeropend_.+?(?=\n\n\S|\Z)", re.MULTILINE | re.DOTALL)
@@ -141,18 +159,18 @@ def test_python_in_a_document_runs(path):
             assert {state: set(equation) for state, equation in found.items()} == {"x": {"x", "u"}, "y": {"y", "u"}}
 
 
-def test_the_equations_that_the_readme_shows_are_those_of_the_simulated_rig():
+def test_the_equations_that_the_guide_shows_are_those_of_the_simulated_rig():
     true = in_library(load("bench"))
     for state in ("theta_dot", "i_a", "omega"):
-        (shown,) = re.findall(rf"^    d\({state}\)/dt = (.+)$", README, re.MULTILINE)
+        (shown,) = re.findall(rf"^    d\({state}\)/dt = (.+)$", GUIDE["identification"], re.MULTILINE)
         terms = re.findall(r"(-?) ?\(([\d.e-]+) ± ([\d.e-]+)\) (\S+)", shown)
         assert {term for *_, term in terms} == true[state].keys()
         for sign, value, sigma, term in terms:
             assert abs(float(sign + value) - true[state][term]) < 3.0 * float(sigma), term
 
 
-def test_import_proposes_what_the_readme_shows(tmp_path, monkeypatch, capsys):
-    shown = README.partition(".venv/bin/import messung.csv\n")[2].partition("\n\nSay")[0]
+def test_import_proposes_what_the_guide_shows(tmp_path, monkeypatch, capsys):
+    shown = GUIDE["import"].partition(".venv/bin/import messung.csv\n")[2].partition("\n\nSay")[0]
     angle = np.array([-83.0, -83.0, -82.9, -83.2, 1.4, *[-40.0] * 595])
     rows = [f"{0.02 * k:.3f};{theta:.1f}".replace(".", ",") + f";{255 * (k > 99)}\n" for k, theta in enumerate(angle)]
     (tmp_path / "messung.csv").write_text("Zeit [s];Winkel [°];Tastgrad\n" + "".join(rows), encoding="utf-8")

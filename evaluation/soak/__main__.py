@@ -41,10 +41,10 @@ EXAMPLES = """examples:
   make soak
   make soak ARGS="--minutes 5 --seed 3"
   make soak ARGS="--minutes 2 --faults kill stop clock"
-  make soak ARGS=--readme              the table of the last full run goes into README.md
+  make soak ARGS=--docs                the table of the last full run goes into docs/results/soak.md
 
 exit codes: 0 every promise was kept, 1 one was broken, 2 a wrong command line, or no results for the
-README, 130 interrupted"""
+page, 130 interrupted"""
 
 Say = Callable[[str], None]
 
@@ -160,11 +160,11 @@ def main() -> int:
     parser.add_argument("--faults", nargs="*", default=["all"], metavar="FAULT",
                         help="only those that have this in their names; none: steady work only. "
                         + ", ".join(FAULTS))
-    results.offer_readme(parser)
+    results.offer_page(parser, "soak")
     options = parser.parse_args()
-    if options.readme is not None:
+    if options.page is not None:
         try:
-            results.show(options.readme, "soak", results.full(RESULTS), readme)
+            results.show(options.page, "soak", results.full(RESULTS), readme)
         except ValueError as error:
             parser.error(str(error))
         return 0
