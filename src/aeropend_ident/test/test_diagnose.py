@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from commands import Command
 
+from aeropend_ident.diagnosis.document import NextExperiment
 from aeropend_ident.diagnosis.results import experiment
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import rig
@@ -174,6 +175,6 @@ def test_what_one_recording_says_is_shown_on_others(tmp_path, bags):
 
 
 def test_the_advised_experiment_can_be_pasted_into_a_shell():
-    advice = {"why": "w", "excite": {"kind": "steps", "duration": 60.0, "sequence": [0.1, 0.5]}}
+    advice = NextExperiment("w", {"kind": "steps", "duration": 60.0, "sequence": (0.1, 0.5)})
     words = shlex.split(experiment(advice).removesuffix(" (w)"))
     assert words == ["excite", "--ros-args", "-p", "kind:=steps", "-p", "duration:=60.0", "-p", "sequence:=[0.1, 0.5]"]
