@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sparse identification: which terms are found, how near to the Cramér-Rao limit, and how fast, beside pysindy."""
+"""Sparse identification: terms found, errors over the Cramér-Rao limit, and speed, beside pysindy and scipy."""
 
 import math
 import os
@@ -44,7 +44,7 @@ SEEDS, QUICK = 20, 3
 
 
 def limits(seed: int, sigma: Array) -> dict[tuple[str, str], float]:
-    """Cramér-Rao 1 sigma of every true coefficient, from all 70 s."""
+    """Cramér-Rao standard deviation of each true coefficient, for all 70 s."""
     x, v = states(seed)
     true = in_library(load("thesis"))
     matrix = np.array([[true[s].get(t, 0.0) for t in LIBRARY.names] for s in STATES])
@@ -72,7 +72,7 @@ def _pool() -> ProcessPoolExecutor:
 
 
 def of_each(quick: bool, function: Callable[..., Any], *same: Any, seeds: int = SEEDS) -> list[Any]:
-    """What a function says of each seed, in processes on every core: its accuracy does not depend on its time."""
+    """Results of a function for each seed, in a process on each core: run times are not measured here."""
     return list(_pool().map(function, range(QUICK if quick else seeds), *map(repeat, same)))
 
 
@@ -95,7 +95,7 @@ def exact(quick: bool) -> list[Figure]:
 
 
 class Noisy(NamedTuple):
-    """What came of noisy data: terms right, errors over their limits, error of K_q, terms wrong, s."""
+    """Result on noisy data: terms right, errors over their limits, error of K_q, wrong terms, [s] run time."""
 
     right: bool
     ratios: list[float]
@@ -145,7 +145,7 @@ def _chain(seed: int) -> tuple[float, float, float, float]:
     read, _ = rig.record(model, duty, seed)
     try:
         found = identify(dataset.from_readings({**read, "duty": duty}, SAMPLE_PERIOD, model.sensing), "weak")
-    except RecordingError:  # it said that it cannot tell
+    except RecordingError:  # refused with a message
         return 0.0, 0.0, math.inf, math.nan
     return (float(set(found.equations["theta_dot"]) == set(true["theta_dot"])),
             float(lorenz.is_exact(found.equations, true)),
@@ -171,7 +171,7 @@ def _lorenz(seed: int) -> tuple[bool, bool]:
 
 
 def study(quick: bool) -> list[Figure]:
-    """The Lorenz system with 5 % noise, beside pysindy's weak form with a threshold that knows the answer."""
+    """The Lorenz system with 5 % noise, beside pysindy's weak form with a threshold chosen for the true answer."""
     about = measure.load()
     _pysindy()
     ours, peer = np.mean(of_each(quick, _lorenz), axis=0).tolist()
@@ -206,7 +206,7 @@ def _pysindy_lorenz(seed: int) -> dict[str, dict[str, float]]:
 
 
 def speed(quick: bool) -> list[Figure]:
-    """Weak form with selection on 34,313 x 31, and peak memory of the whole identification; beside pysindy."""
+    """Weak form with selection on 34,313 samples x 31 terms, beside pysindy; peak memory of `identify`."""
     about = measure.load()
     y, _ = noisy(0, 50.0)
     v = states(0)[1]
