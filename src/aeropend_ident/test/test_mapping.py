@@ -100,7 +100,7 @@ def test_what_was_not_measured_is_not_there(tmp_path):
     ((*MAPPED, "--motor-off", "--duty", "pwm:%"), "contradict each other"),
     ((*MAPPED, "--accept"), "give one"),
     (("--rate", "-5", "--theta", "x:deg"), "is not a rate"),
-    (("--rate", "50", "--theta", "x:deg", "--clock", "even"), "leave it away"),
+    (("--rate", "50", "--theta", "x:deg", "--clock", "even"), "omit it"),
     ((*MAPPED, "--delimiter", "ab"), "cannot split cells"),
     ((*MAPPED, "--sheet", "One"), "is no workbook"),
     ((*MAPPED, "--nonsense"), "unrecognized arguments"),

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes a recording of a table: `import run.csv my_bag --time t:ms --theta angle:deg --duty pwm:%`.
+"""Convert a table to a recording: `import run.csv my_bag --time t:ms --theta angle:deg --duty pwm:%`.
 
-Without options that say what the columns are, it shows the table and proposes them; a proposal is taken only with
---accept. Exit code 0 with a recording, 2 with one line on standard error when the table cannot be used.
+Without options for the columns, the command shows the table and proposes options. --accept uses the proposal.
+Exit code 0: a recording is written; 2: the table cannot be used, with one line on standard error.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from aeropend_ident.tables.clock import CLOCKS
 from aeropend_ident.tables.guess import Guess, guess, is_obvious, option, options
 from aeropend_ident.tables.mapping import Plan, Samples, no_time, samples
 from aeropend_ident.tables.table import Table, TableError, many
-from aeropend_ident.tables.units import UNITS, told
+from aeropend_ident.tables.units import UNITS, listed
 from aeropend_ident.tables.write import BagExistsError, write
 from aeropend_sim.cli.command import EXIT_CODES, Parser, between, interruptible, own
 from aeropend_sim.cli.progress import progress
@@ -36,51 +36,51 @@ DELIMITERS = {"tab": "\t", "blank": " ", "blanks": " ", "space": " ", "\\t": "\t
 
 EXAMPLES = f"""\
 examples:
-  import run.csv                                      show the columns, and propose what they are
-  import run.csv my_bag --accept                      take the proposal
+  import run.csv                                      show the columns and propose options
+  import run.csv my_bag --accept                      use the proposed options
   import run.csv my_bag --time "t [ms]:ms" --theta angle:deg --duty pwm:counts:255
   import fall.csv my_bag --time 1:s --theta 2:deg --zero end --motor-off
   import day1.xlsx day2.xlsx bags --sheet Data --time 1:s --theta 2:deg --duty 3:%
   import adc.npy my_bag --rate 490 --theta 1:counts:1024 --zero 512 --flip
 
-A column is named as the file names it, or by its number from 1 on. A unit may have a size: `--theta pot:54deg` where
-one volt is 54 degrees, `--current adc:-4.9mA`. Several files become a recording each, in the folder named last.
+COLUMN is the name of a column in the file, or its number, from 1. A unit may have a factor: `--theta pot:54deg` if one
+volt is 54 degrees, `--current adc:-4.9mA`. With several files, each becomes a recording in the folder given last.
 
 {EXIT_CODES}"""
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
-    """Read the command line; exits with 2 and one line where it is wrong."""
+    """Read the command line; exits with code 2 and one line if it is wrong."""
     parser = Parser(
         prog="import", usage="import FILE [FILE ...] BAG [--time COLUMN:UNIT] [--theta COLUMN:UNIT] [options]",
         epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Make a recording of a table: CSV, TSV, text, Excel (.xlsx), MATLAB (.mat) or NumPy (.npy, .npz). "
-                    "Clocks that are late, rounded,\nrepeated or wrapped are repaired, and what was done is told.")
+        description="Convert a table to a recording: CSV, TSV, text, Excel (.xlsx), MATLAB (.mat), NumPy (.npy, .npz). "
+                    "Time stamps that are late, rounded,\nrepeated or wrapped are repaired; the repairs are listed.")
     parser.add_argument("paths", nargs="+", metavar="FILE",
-                        help="the table, and last the recording to make (BAG); with several, a folder for theirs")
-    columns = parser.add_argument_group("what the columns are (COLUMN or COLUMN:UNIT)")
-    about = {"time": "when the row was measured", "theta": "angle of the arm", "duty": "duty applied",
+                        help="the table, then the recording to write (BAG); for several tables, a folder of recordings")
+    columns = parser.add_argument_group("meaning of the columns (COLUMN or COLUMN:UNIT)")
+    about = {"time": "time of the row", "theta": "angle of the arm", "duty": "applied duty",
              "omega": "speed of the rotor", "current": "current of the motor", "voltage": "voltage at the motor",
-             "reference": "what the arm (or the rotor) was to reach"}
+             "reference": "reference of the arm's angle or the rotor's speed"}
     for quantity in UNITS:
         columns.add_argument(f"--{quantity}", metavar="COLUMN:UNIT",
-                             help=f"{about[quantity]}: {told(quantity)}".replace("%", "%%"))
-    columns.add_argument("--accept", action="store_true", help="take what is proposed for the columns")
-    more = parser.add_argument_group("what the table does not say")
+                             help=f"{about[quantity]}: {listed(quantity)}".replace("%", "%%"))
+    columns.add_argument("--accept", action="store_true", help="use the proposed options for the columns")
+    more = parser.add_argument_group("information that is not in the table")
     more.add_argument("--rate", type=between(0.1, 1e6, "a rate", "Hz"), metavar="HZ",
-                      help="the rows are evenly spaced, so many a second")
+                      help="the rows are evenly spaced, at this rate")
     more.add_argument("--zero", metavar="READING",
-                      help="what --theta reads when the arm hangs: -83deg, or a number in its unit, or `start` or "
-                           "`end` where it hangs at rest there; default 0")
-    more.add_argument("--flip", action="store_true", help="--theta falls when the arm is lifted")
-    more.add_argument("--motor-off", action="store_true", help="the duty was 0 all the time, as in a free swing")
+                      help="reading of --theta when the arm hangs: -83deg, or a number in its unit; `start` or `end` "
+                           "if it hangs at rest at the start or the end; default 0")
+    more.add_argument("--flip", action="store_true", help="--theta decreases when the arm is lifted")
+    more.add_argument("--motor-off", action="store_true", help="the duty was always 0, as in a free swing")
     more.add_argument("--clock", choices=CLOCKS, default="auto",
-                      help="even: the rows are evenly spaced, whatever their stamps; stamps: every stamp is right; "
-                           "auto finds out and says why")
-    more.add_argument("--sheet", metavar="NAME", help="of a workbook that holds several tables")
+                      help="even: the rows are evenly spaced and the stamps are not exact; stamps: every stamp is "
+                           "right; auto: choose by the data and report why")
+    more.add_argument("--sheet", metavar="NAME", help="sheet of a workbook with several tables")
     more.add_argument("--delimiter", type=_delimiter, metavar="MARK", help="between cells: , ; tab blank or another")
-    more.add_argument("--decimal", choices=(".", ","), metavar="MARK", help="of decimals: . or ,")
-    more.add_argument("--skip-bad", action="store_true", help="leave out rows that cannot be read")
+    more.add_argument("--decimal", choices=(".", ","), metavar="MARK", help="decimal mark: . or ,")
+    more.add_argument("--skip-bad", action="store_true", help="skip rows that cannot be read")
     given = parser.parse_args(_joined(arguments))
     given.files, given.bag = [Path(path) for path in given.paths], None
     if len(given.paths) > 1:
@@ -96,10 +96,10 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     if given.rate is not None and given.time:
         parser.error("--rate and --time contradict each other: give one")
     if given.rate is not None and given.clock != "auto":
-        parser.error("--clock is about stamps: leave it away with --rate")
+        parser.error("--clock applies to stamps: omit it with --rate")
     named = [quantity for quantity in UNITS if getattr(given, quantity)]
     if given.accept and named:
-        parser.error(f"--accept takes the proposal, --{named[0]} says otherwise: give one")
+        parser.error(f"--accept and --{named[0]} contradict each other: give one")
     return given
 
 
@@ -122,16 +122,21 @@ def _delimiter(text: str) -> str:
 
 
 def plan_of(given: argparse.Namespace) -> Plan:
-    """What the command line says of the columns."""
+    """The options of the command line as a plan for the columns."""
     return Plan(**{quantity: getattr(given, quantity) for quantity in UNITS}, rate=given.rate, zero=given.zero,
                 flip=given.flip, motor_off=given.motor_off, clock=given.clock, skip_bad=given.skip_bad)
 
 
 def run(given: argparse.Namespace, arguments: Sequence[str]) -> int:
-    """Import, or propose how to; returns the exit code.
+    """Import the tables, or propose options; returns the exit code.
+
+    Args:
+        given: the parsed command line.
+        arguments: the command line, for messages and metadata.
 
     Raises:
-        TableError, BagExistsError: a table cannot be used, or a recording not be made.
+        TableError: a table cannot be used, or a recording cannot be written.
+        BagExistsError: a recording exists already.
     """
     plan = plan_of(given)
     if given.bag is None and (given.accept or plan.columns()):
@@ -173,7 +178,13 @@ def _enough(chosen: dict[str, str], found: Sequence[Guess], plan: Plan) -> bool:
 
 
 def about(file: Path, arguments: Sequence[str], taken: Samples) -> dict[str, str]:
-    """Where a recording comes from, for its metadata; no folders of this machine."""
+    """Origin of a recording, for its metadata; without folders of this machine.
+
+    Args:
+        file: the table.
+        arguments: the command line.
+        taken: the samples.
+    """
     words = [Path(word).name if Path(word).name and not word.startswith("-") and Path(word).parent.is_dir()
              and "/" in word else word for word in arguments]
     found = {"imported_from": [file.name], "import_command": [shlex.join(["import", *words])],
@@ -182,7 +193,13 @@ def about(file: Path, arguments: Sequence[str], taken: Samples) -> dict[str, str
 
 
 def tell(bag: Path, file: Path, taken: Samples) -> None:
-    """Say what was made of a file."""
+    """Print the result of an import.
+
+    Args:
+        bag: the recording.
+        file: the table.
+        taken: the samples.
+    """
     seconds = float(taken.stamp_ns[-1] - taken.stamp_ns[0]) * 1e-9
     rate = taken.rows / max(seconds, 1e-9)
     lines = [f"{bag}: {many(taken.rows, 'row')} of {file.name}, {seconds:.1f} s, {rate:.4g} a second"]
@@ -194,7 +211,15 @@ def tell(bag: Path, file: Path, taken: Samples) -> None:
 
 def propose(table: Table, found: Sequence[Guess], chosen: dict[str, str], given: argparse.Namespace,
             arguments: Sequence[str]) -> int:
-    """Show a table and the command that would import it; returns the exit code."""
+    """Show a table and the command that would import it; returns the exit code.
+
+    Args:
+        table: the table.
+        found: a guess for each column.
+        chosen: the proposed options.
+        given: the parsed command line.
+        arguments: the command line.
+    """
     console = Console(highlight=False)
     if not console.is_terminal:
         console = Console(highlight=False, width=10_000)
@@ -226,14 +251,14 @@ def propose(table: Table, found: Sequence[Guess], chosen: dict[str, str], given:
     for k, one in enumerate(found):
         if one.quantity and not one.sure:
             print(printable(f"  perhaps --{one.quantity} {shlex.quote(option(table, k, one))} ({one.why})"))
-    off = "." if "duty" in chosen or given.motor_off else ",\n--motor-off if the motor was off all the time."
-    print("\nAdd --zero READING if --theta does not read 0 when the arm hangs, --flip if it falls when the arm is "
+    off = "." if "duty" in chosen or given.motor_off else ",\n--motor-off if the motor was always off."
+    print("\nAdd --zero READING if --theta is not 0 when the arm hangs, --flip if it decreases when the arm is "
           f"lifted{off}")
     if _enough(chosen, found, plan_of(given)):
-        print("import: nothing imported yet: say what the columns are, as above, or take that with --accept",
+        print("import: nothing imported yet: give the options of the columns as above, or use them with --accept",
               file=sys.stderr)
     else:
-        print("import: nothing imported: say what the columns are, which is not clear", file=sys.stderr)
+        print("import: nothing imported: give the meaning of the columns, which is not clear", file=sys.stderr)
     return 2
 
 

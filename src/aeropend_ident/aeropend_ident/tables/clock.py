@@ -1,18 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When the rows of a table were sampled, from stamps that need not be right.
+"""Times of sampling of the rows of a table, from stamps that may be wrong.
 
-Stamps of tables are of sampling or of arrival, rounded, repeated, wrapped or set back. There are two ways to date rows
-that are not on a grid as they are:
+Stamps are times of sampling or of arrival. They may be rounded, repeated, wrapped or set back. If the stamps are not on
+a grid, there are two hypotheses:
 
-- evenly: the rows were sampled at a steady rate, and the stamps, taken when they arrived, only tell how fast; or, where
-  a serial line was the bottleneck, at a rate that depends on the length of what was sent;
-- as stamped: the rows were sampled when they say, however irregular that is.
+- even clock: the rows were sampled at a constant rate, and the stamps are times of arrival, which give the rate only.
+  If a serial line was the bottleneck, the time between rows depends on the length of the rows.
+- stamps: the rows were sampled at their stamps, however irregular these are.
 
-Which one is true is asked of the arm: it moves smoothly, so its angle is predicted better by its neighbours on the true
-clock than on the other. Where it does not say, the stamps themselves do: what arrives late does not wander off.
+The arm decides: it moves smoothly, so on the true clock its angle is predicted better from the neighbouring samples. If
+this is not significant, the stamps decide: times of arrival do not drift away from the even clock.
 
-Rows that are irregular are put on a grid fine enough not to move them, with nothing measured in between: no reading is
-made up by interpolation.
+Irregular rows are put on a grid that is fine enough not to move them. Its other cells have no readings; nothing is
+interpolated.
 """
 
 from __future__ import annotations
@@ -31,86 +31,88 @@ from aeropend_ident.tables.table import Floats, Ints, many
 CLOCKS = ("auto", "even", "stamps")
 
 WRAPS_OF_COUNTERS = tuple(float(2**bits) for bits in (16, 32))
-"""Where counters of ticks start anew, ticks."""
+"""[ticks] Values at which counters wrap."""
 
 WRAPS_OF_CLOCKS = (86400.0, 43200.0, 3600.0, 60.0)
-"""Where times of day start anew, s."""
+"""[s] Values at which times of day wrap."""
 
 TICKS = (1e-6, 1e-3)
-"""Sizes of the ticks that counters of time usually count, s."""
+"""[s] Usual ticks of counters of time."""
 
 BLOCKS = 300
-"""Parts of a recording through whose earliest arrivals the even clock is drawn; all pairs of them are compared."""
+"""Number of blocks whose earliest arrivals determine the even clock; all pairs are compared (choice)."""
 
 FEWEST_TO_WRAP = 10
-"""Rows that at least lie between one start anew of a clock and the next."""
+"""Least number of rows between two wraps of a clock (choice)."""
 
 BACK = 1.0
-"""s back in time that is no late stamp: a restart, or a clock that was set."""
+"""[s] A greater step back in time is a restart or a setting of the clock, not a late stamp (choice)."""
 
 WINDOW, BURSTS = 64, 4
-"""Rows, and bursts of rows, over which stamps of arrival even out."""
+"""Numbers of rows, and of bursts of rows, over which delays of arrival average out (choices)."""
 
 CLOSER = 0.85
-"""How much closer stamps must be to a clock that goes by the length of the rows than to an even one."""
+"""Greatest ratio of the deviations from the clock of a serial line to those from the even clock (choice)."""
 
 SMOOTHED = 128
-"""Rows to either side over which stamps of arrival are smoothed where they fit no even clock."""
+"""Number of rows to either side for the smoothing of stamps that fit no even clock (choice)."""
 
 ON_GRID = 0.05
-"""Part of a period by which a stamp may miss its grid and still be on it."""
+"""Share of a period by which a stamp on a grid may deviate from it (choice)."""
 
 MANY = 0.02
-"""Share of rows followed by a gap from which on the gaps themselves are in doubt."""
+"""Share of rows before a gap above which the gaps themselves are in doubt (choice)."""
 
 LOOSE = 0.2
-"""Part of a period by which a pause may miss a whole number of them and still be one of lost rows."""
+"""Share of a period by which a gap of lost rows may deviate from a whole number of periods (choice)."""
 
 STEADY = 0.1
-"""Part of a period by which steps may differ where they do not add up to more than `ADDED` s."""
+"""Share of a period by which steps may differ if they add up to at most `ADDED` (choice)."""
 
 ADDED = 5e-3
+"""[s] Greatest deviation from the grid that such steps add up to (choice)."""
 
 SURE = 3.0
-"""Standard errors from which on the angle tells which clock is true."""
+"""Least difference of the roughness on both clocks, in standard errors, for the angle to decide (choice: 3 sigma)."""
 
 ROUGHER = 1.1
-"""Times rougher that the angle must be on the other clock."""
+"""Least ratio of the roughness on both clocks for the angle to decide (choice)."""
 
 FINEST = 10
-"""Cells of a grid for irregular rows in the shorter of their steps."""
+"""Greatest number of cells in a short step (10th percentile) of a grid for irregular rows (choice)."""
 
 SNAPPED = 0.03
-"""RMS by which irregular rows may be moved onto such a grid, in the shorter of their steps."""
+"""RMS by which irregular rows may be moved onto such a grid, as a share of a short step (choice)."""
 
 NEGLIGIBLE = 1e-4
-"""s by which they may be moved in any case."""
+"""[s] RMS by which they may be moved in any case (choice)."""
 
 MOST_BACK = 3
-"""Times that a clock may be set back in a recording."""
+"""Greatest number of times that the clock may be set back in a recording (choice)."""
 
 UNFILLED = 1.0
-"""s without a row from which on it is a gap in the grid, not a part of it without readings."""
+"""[s] A longer time without a row is a gap in the grid, and not a part of it without readings (choice)."""
 
 MOST_SAMPLES = 10_000_000
+"""Greatest number of samples on the grid (choice)."""
 
 REPEATED = 0.05
-"""Share of rows that can be out of order, or with the stamp of the row before be left out."""
+"""Greatest share of rows that are sorted, or left out because they have the stamp of the row before (choice)."""
 
 
 class ClockError(ValueError):
-    """Rows cannot be dated; the message is part of a line for a person."""
+    """The times of the rows cannot be determined; the message is part of a line for the user."""
 
 
 @dataclass(frozen=True, eq=False)
 class Dated:
-    """Samples with the instants they were taken at.
+    """Samples with their times of sampling.
 
     Attributes:
-        time: (M,) s, rising.
-        rows: (M,) row of the table for each; -1 where nothing was measured.
-        period: s between the cells of the grid.
-        notes: what was done to the stamps, one line each.
+        time: [s] (M,) rising.
+        rows: (M,) row of the table for each sample; -1 without a row.
+        period: [s] between the cells of the grid.
+        notes: repairs of the stamps, one line each.
     """
 
     time: Floats
@@ -120,31 +122,31 @@ class Dated:
 
     @property
     def measured(self) -> int:
-        """How many samples hold readings."""
+        """Number of samples with readings."""
         return int((self.rows >= 0).sum())
 
 
 def at_rate(count: int, rate: float) -> Dated:
-    """Rows at a rate in Hz that a person tells."""
+    """Times for `count` rows at a rate [Hz] that the user gives."""
     return Dated(np.arange(count) / rate, np.arange(count), 1.0 / rate, ())
 
 
 def date(time: Floats, angle: Floats, lines: Ints, *, is_clock: bool = False, tick: float = 1.0,
          repeats: NDArray[np.bool_] | None = None, lengths: Ints | None = None, clock: str = "auto") -> Dated:
-    """Date the rows of a table.
+    """Determine the times of sampling of the rows of a table.
 
     Args:
-        time: (N,) stamps, s; NaN where there is none.
-        angle: (N,) of the arm, in any unit; NaN where there is none. It tells which clock is true.
-        lines: (N,) where the rows are in the file, for messages.
+        time: [s] (N,) stamps; NaN if missing.
+        angle: (N,) of the arm, in any unit; NaN if missing. It decides between the clocks.
+        lines: (N,) positions of the rows in the file, for messages.
         is_clock: the stamps are times of day.
-        tick: what one count in the file is, s.
-        repeats: (N,) rows that repeat the row before to the last cell.
-        lengths: (N,) characters of the rows, where they came as text.
-        clock: "even" or "stamps" where a person knows better.
+        tick: [s] the number 1 of the file.
+        repeats: (N,) whether a row is equal to the row before.
+        lengths: (N,) number of characters of the rows; None if the file is not text.
+        clock: "auto", or "even" or "stamps" by the choice of the user.
 
     Raises:
-        ClockError: they cannot be dated.
+        ClockError: the times cannot be determined.
     """
     rows = np.flatnonzero(np.isfinite(time))
     notes = []
@@ -216,7 +218,7 @@ def _dated(t: Floats, rows: Ints, angle: Floats, lines: Ints, lengths: Ints | No
 
 
 def _unwrapped(t: Floats, is_clock: bool, tick: float) -> tuple[Floats, int]:
-    """Count on where a clock starts anew: it does so at numbers that are known. Returns the times and how often."""
+    """Unwrap a clock, which wraps at known values. Returns the times and the number of wraps."""
     steps = np.diff(t)
     ahead = steps[steps > 0.0]
     if not len(ahead) or not (steps < 0.0).any():
@@ -235,7 +237,7 @@ def _unwrapped(t: Floats, is_clock: bool, tick: float) -> tuple[Floats, int]:
 
 
 def _without_repeats(t: Floats, rows: Ints, repeats: NDArray[np.bool_], notes: list[str]) -> tuple[Floats, Ints]:
-    """Leave rows out that repeat the one before to the last cell, where no others have its stamp."""
+    """Leave out rows that are equal to the row before, if only such rows have repeated stamps."""
     same = np.concatenate(([False], np.diff(t) == 0.0))
     if not same.any() or not repeats[rows][same].all():
         return t, rows
@@ -244,7 +246,7 @@ def _without_repeats(t: Floats, rows: Ints, repeats: NDArray[np.bool_], notes: l
 
 
 def _sorted(t: Floats, rows: Ints, notes: list[str]) -> tuple[Floats, Ints]:
-    """Sort rows that lie on a grid once they are sorted."""
+    """Sort the rows by their stamps if the sorted stamps are on a grid."""
     if not (np.diff(t) < 0.0).any():
         return t, rows
     order = np.argsort(t, kind="stable")
@@ -263,10 +265,12 @@ class _Grid:
     """Cells of rows on an even clock.
 
     Attributes:
-        cells: (N,) rising, whole numbers where the clock is even. period: s.
-        off: (N,) s by which stamps are later than their cells.
-        jumps: (K,) rows before a gap or a step back of the clock; steps: (K,) s that is.
-        wanders: the stamps leave the even clock and do not come back.
+        cells: [periods] (N,) rising; whole numbers if the clock is even.
+        period: [s] of the clock.
+        off: [s] (N,) stamps minus times of their cells.
+        jumps: (K,) rows before a gap or a step back of the clock.
+        steps: [s] (K,) sizes of these gaps and steps.
+        wanders: the stamps drift away from the even clock.
     """
 
     cells: Floats
@@ -290,7 +294,7 @@ class _Grid:
 
 
 def _grid(t: Floats) -> _Grid | None:
-    """The grid that stamps (N,) lie on as they are; None where there is none."""
+    """The grid of stamps (N,) [s]; None if they are not on a grid."""
     steps = np.diff(t)
     if (steps <= 0.0).any():
         return None
@@ -371,9 +375,9 @@ def _even(t: Floats, index: Floats) -> _Grid:
 
 
 def _jumps(late: Floats, period: float, window: int) -> tuple[Ints, Floats]:
-    """Where lateness (N,) steps and stays: rows before it, and the size of the steps, s.
+    """Permanent steps of the lateness [s] (N,): the rows before them, and their sizes [s].
 
-    What arrives late is caught up with; only where all rows after are later than all rows before, rows are missing.
+    A delay of arrival is temporary. Rows are missing only if all rows after a step are later than all rows before it.
     """
     n = len(late)
     ahead, behind = _extremes(late, window)
@@ -392,7 +396,7 @@ def _jumps(late: Floats, period: float, window: int) -> tuple[Ints, Floats]:
 
 
 def _extremes(x: Floats, window: int) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
-    """Least and largest of the `window` values from each on, and up to each."""
+    """Least and greatest of the `window` values from each value on, and up to each value."""
     half = window // 2
     ahead, behind = ((minimum_filter1d(x, window, mode="nearest", origin=origin),
                       maximum_filter1d(x, window, mode="nearest", origin=origin))
@@ -401,7 +405,7 @@ def _extremes(x: Floats, window: int) -> tuple[tuple[Floats, Floats], tuple[Floa
 
 
 def _on(grid: _Grid, t: Floats, rows: Ints, lines: Ints, notes: list[str]) -> Dated:
-    """Put rows on the cells of a grid, and tell of its gaps."""
+    """Put rows on the cells of a grid, with notes on its gaps."""
     _tell_jumps(grid, lines, notes)
     return Dated(float(t[0]) + grid.times, rows, grid.period, tuple(notes))
 
@@ -425,7 +429,7 @@ def _tell_jumps(grid: _Grid, lines: Ints, notes: list[str]) -> None:
 
 
 def _paced(t: Floats, lengths: Ints | None, even: _Grid) -> tuple[_Grid, str, bool] | None:
-    """The clock of rows of which each took as long as a serial line needed to send it; None where none did."""
+    """The clock of a serial line, whose time for a row depends on the row's length; None if it does not fit better."""
     if lengths is None or np.ptp(lengths) == 0:
         return None
     n = np.arange(len(t), dtype=float)
@@ -442,10 +446,10 @@ def _paced(t: Floats, lengths: Ints | None, even: _Grid) -> tuple[_Grid, str, bo
 
 
 def _smoothed(t: Floats) -> _Grid:
-    """The clock of rows that came faster and slower: their stamps, smoothed.
+    """The clock of rows at a varying rate: the smoothed stamps.
 
     Raises:
-        ClockError: that is no clock.
+        ClockError: the smoothed stamps do not rise.
     """
     width = min(2 * SMOOTHED + 1, (len(t) - 1) // 2 * 2 - 1)
     times = savgol_filter(t, width, 1)
@@ -457,13 +461,19 @@ def _smoothed(t: Floats) -> _Grid:
 
 
 def smoother(angle: Floats, first: Floats, second: Floats) -> tuple[float, float]:
-    """Whether readings (N,) are smoother over the second clock (N,) than over the first.
+    """Whether readings are smoother over the second clock than over the first.
 
-    Each is predicted by the cubic through the two on either side, and the error taken in its own standard deviation if
-    the noise is white.
+    Each reading is predicted by the cubic through two neighbours on either side. The error is divided by its standard
+    deviation for white noise.
+
+    Args:
+        angle: (N,) readings.
+        first: [s] (N,) times by the first clock.
+        second: [s] (N,) times by the second clock.
 
     Returns:
-        By how many standard errors it is smoother (negative: rougher), and how many times rougher the first is.
+        The difference of the log errors in standard errors (positive: the second clock is smoother), and the ratio of
+        the RMS errors, first to second.
     """
     known = np.flatnonzero(np.isfinite(angle))
     if len(known) < 40 or np.ptp(angle[known]) == 0.0:
@@ -479,7 +489,7 @@ def smoother(angle: Floats, first: Floats, second: Floats) -> tuple[float, float
 
 
 def _prediction_errors(y: Floats, x: Floats) -> Floats:
-    """Errors (N - 4,) of the cubic through two neighbours on either side, over what white noise would make them."""
+    """Errors (N - 4,) of the cubic through two neighbours on either side, divided by those of white noise of SD 1."""
     at = np.stack([x[k : len(x) - 4 + k] for k in (0, 1, 3, 4)])
     values = np.stack([y[k : len(y) - 4 + k] for k in (0, 1, 3, 4)])
     centre = x[2:-2]
@@ -539,7 +549,7 @@ def _on_fine(t: Floats, rows: Ints, lines: Ints, notes: list[str]) -> Dated:
 
 
 def _resolution(t: Floats) -> float:
-    """What the stamps are rounded to, s; 0 where that does not show."""
+    """[s] The decimal resolution of the stamps; 0 if none is found."""
     for digits in range(7):
         scaled = t * 10.0**digits
         if np.abs(scaled - np.rint(scaled)).max() < 0.02:
@@ -548,7 +558,7 @@ def _resolution(t: Floats) -> float:
 
 
 def _pattern(t: Floats) -> str:
-    """How the stamps step, in words."""
+    """Description of the steps of the stamps, in words."""
     steps = np.diff(t)
     usual = float(np.median(steps[steps > 0.0]))
     longer = np.flatnonzero(steps > 3.0 * usual)
@@ -563,7 +573,7 @@ def _pattern(t: Floats) -> str:
 
 
 def _short(seconds: float) -> str:
-    """A time for a person."""
+    """A time as text with a unit."""
     for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
         if abs(seconds) >= 0.9999 * size or unit == "µs":
             return f"{seconds / size:.4g} {unit}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables in files of every kind, told apart by their first bytes, never by their names.
+"""Tables in files of several formats, which are recognised by their first bytes and not by their names.
 
 The files may come from anybody: nothing in them is run (no pickles, no formulas), what they would take in memory is
 known before they are unpacked, and nothing but the file itself is read.
@@ -114,7 +114,7 @@ def _kind(path: Path) -> str:
 
 
 def _workbook(path: Path, sheet: str | None) -> Table:
-    """Read a sheet. Formulas count with the values that Excel has left in the file."""
+    """Read a sheet. The value of a formula is the one that Excel stored in the file."""
     import openpyxl
 
     with zipfile.ZipFile(path) as archive:
@@ -156,8 +156,8 @@ def _sheet(path: Path, book: Any, wanted: str | None) -> Table:
 
 
 def _cells(path: Path, sheet: Any) -> Table | None:
-    """The rows of a sheet as a table; None where there are hardly any numbers."""
-    sheet.reset_dimensions()  # what the file says of them need not be true
+    """The rows of a sheet as a table; None without a table of numbers."""
+    sheet.reset_dimensions()  # the dimensions in the file may be wrong
     rows: list[tuple[Any, ...]] = []
     numbers: list[int] = []
     width = 0
@@ -196,7 +196,7 @@ def _cells(path: Path, sheet: Any) -> Table | None:
 
 
 def _number(cell: Any) -> float | None:
-    """A cell as a number: dates and times of day in s; None where it is none."""
+    """A cell as a number, dates and times of day in s; None for other cells."""
     if isinstance(cell, bool) or cell is None:
         return None
     if isinstance(cell, (int, float)):
@@ -297,7 +297,7 @@ def _numpy_says(error: Exception) -> str:
 
 
 def _matlab(path: Path) -> Arrays:
-    """Read a MATLAB file in a process of its own: damaged ones crash the libraries that read them."""
+    """Read a MATLAB file in a process of its own, because damaged files crash the libraries."""
     full = str(path.resolve())
     child = subprocess.run([sys.executable, "-m", "aeropend_ident.tables.matlab", full], check=False, cwd="/",
                            capture_output=True, stdin=subprocess.DEVNULL)  # "/": -m looks for modules where it starts
@@ -314,7 +314,7 @@ def _matlab(path: Path) -> Arrays:
 
 
 def _of_arrays(path: Path, arrays: Arrays) -> Table:
-    """The columns of arrays that go together: those with the length that most columns have."""
+    """The columns of arrays with the most frequent length."""
     columns: list[tuple[str, NDArray[Any]]] = []
     notes = []
     for name, array in arrays.items():
@@ -340,7 +340,7 @@ def _of_arrays(path: Path, arrays: Arrays) -> Table:
 
 
 def _columns(path: Path, name: str, array: NDArray[Any]) -> list[tuple[str, NDArray[Any]]]:
-    """The columns of an array of numbers; the longer side counts the samples."""
+    """The columns of an array of numbers; the longer side is that of the samples."""
     array = np.squeeze(array)
     if array.ndim == 1:
         return [(name, array)]

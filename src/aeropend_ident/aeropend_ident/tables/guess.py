@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the columns of a table probably are, from their names in many languages, their units and their numbers.
+"""Guesses of the meaning of the columns, by their names in many languages, their units and their numbers.
 
-A guess is a proposal to a person; it is never taken without being asked for.
+A guess is a proposal to the user. It is used only if the user asks for it.
 """
 
 from __future__ import annotations
@@ -31,24 +31,26 @@ WORDS: dict[str, str] = {
     "voltage": "voltage v spannung motorspannung voltaje tension tensione tensao spanning spenning napiecie napeti "
                "volt напряжение 电压 電圧 전압",
 }
-"""Quantity -> words for it, without accents, in small letters; the first quantity whose word a name holds counts."""
+"""Quantity -> words for it, in lower case without accents. The first quantity with a word in the name counts."""
 
 OF_UNIT = ("time", "theta", "omega", "current", "voltage", "duty")
-"""Quantities that a unit alone gives away, in the order in which spellings that several have are taken."""
+"""Quantities that can be identified by the unit alone, in order of preference if several have the unit."""
 
 FEWEST = 20
-"""Rows below which a column that rises is no time."""
+"""Least number of rows for a rising column without a name to be the time (choice)."""
 
 _SPLIT = re.compile(r"[^\w°]+|_|(?<=[a-zäöüа-я])(?=\d)|(?<=[a-z])(?=[A-Z])")
 
 
 @dataclass(frozen=True)
 class Guess:
-    """What a column probably is.
+    """A guess of the meaning of a column.
 
     Attributes:
-        quantity: "" where nothing suggests itself. unit: to be written after the column; "" where the file says it.
-        why: in words. sure: whether quantity and unit hardly can be anything else.
+        quantity: the quantity; "" if there is no guess.
+        unit: the unit for the option; "" if the file has it.
+        why: the reason, in words.
+        sure: whether quantity and unit are unambiguous.
     """
 
     quantity: str = ""
@@ -58,7 +60,7 @@ class Guess:
 
 
 def guess(table: Table) -> list[Guess]:
-    """What each column of a table probably is."""
+    """A guess for each column of a table."""
     found = [_of_column(column) for column in table.columns]
     if not any(one.quantity == "time" for one in found):
         found = _unnamed_time(table, found)
@@ -82,31 +84,47 @@ def guess(table: Table) -> list[Guess]:
 
 
 def _agree(table: Table, found: list[Guess], columns: list[int]) -> bool:
-    """Whether columns of time are the same in other units."""
+    """Whether columns of time are equal in different units."""
     sizes = [UNITS["time"].get(found[k].unit or table.columns[k].unit or CLOCK, 0.0) for k in columns]
     times = [size * table.columns[k].values for k, size in zip(columns, sizes)]
     return len(columns) > 1 and all(bool(np.isclose(one, times[0], atol=1e-6, equal_nan=True).all()) for one in times)
 
 
 def options(table: Table, found: list[Guess]) -> dict[str, str]:
-    """Quantity -> "COLUMN:UNIT", of the columns whose quantity and unit are clear."""
+    """Options for the columns whose quantity and unit are unambiguous: quantity -> "COLUMN:UNIT".
+
+    Args:
+        table: the table.
+        found: a guess for each column.
+    """
     out = {one.quantity: option(table, k, one) for k, one in enumerate(found) if one.quantity and one.sure}
     return {quantity: out[quantity] for quantity in UNITS if quantity in out}
 
 
 def option(table: Table, k: int, one: Guess) -> str:
-    """How a guess about column `k` is said on the command line: "COLUMN:UNIT"."""
+    """A guess as an option of the command line: "COLUMN:UNIT".
+
+    Args:
+        table: the table.
+        k: number of the column, from 0.
+        one: the guess.
+    """
     name = table.columns[k].name
     if not name or [column.name for column in table.columns].count(name) > 1:
         name = f"{k + 1}"
     if one.unit:
         return f"{name}:{one.unit}"
-    told = table.columns[k].is_clock or known(one.quantity, table.columns[k].unit)
-    return name if told else f"{name}:UNIT"
+    has_unit = table.columns[k].is_clock or known(one.quantity, table.columns[k].unit)
+    return name if has_unit else f"{name}:UNIT"
 
 
 def is_obvious(chosen: dict[str, str], found: list[Guess]) -> bool:
-    """Whether there is one time and one angle, and nothing else was left undecided."""
+    """Whether time and angle are found and no other guess is uncertain.
+
+    Args:
+        chosen: options by quantity.
+        found: a guess for each column.
+    """
     return {"time", "theta"} <= chosen.keys() and not any(one.quantity and not one.sure for one in found)
 
 
@@ -132,7 +150,7 @@ def _of_column(column: Column) -> Guess:
     if named in by_unit:
         return Guess(named, "", f"its name, in {unit}", sure=True)
     if by_unit and unit not in ("1", "-") and (not named or named != "reference"):
-        # an angle's unit on a column that is called speed, and the like: the unit decides, but not alone
+        # name and unit contradict each other (a speed in degrees): the unit decides, but the guess is not sure
         return Guess(by_unit[0], "", f"its unit, {unit}", sure=not named)
     if not named:
         return Guess()
@@ -141,7 +159,7 @@ def _of_column(column: Column) -> Guess:
 
 
 def _unit_of(quantity: str, values: Floats, words: set[str]) -> tuple[str, str, bool]:
-    """Unit of a column from its numbers: unit, why, and whether that is clear."""
+    """Unit of a column by its numbers: the unit, the reason, and whether it is unambiguous."""
     x = values[np.isfinite(values)]
     whole = bool((x == np.rint(x)).all())
     if quantity == "time":
@@ -185,7 +203,7 @@ def _unit_of_angle(values: Floats) -> tuple[str, str, bool]:
 
 
 def _unnamed_time(table: Table, found: list[Guess]) -> list[Guess]:
-    """The one column without a name that only rises is the time."""
+    """Take the only column without a name that never decreases as the time."""
     rising = []
     for k, (column, one) in enumerate(zip(table.columns, found)):
         x = column.values[np.isfinite(column.values)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the columns of a table to the samples of a rig, as a person says what the columns are."""
+"""Conversion of the columns of a table to the samples of a rig, by the plan of the user."""
 
 from __future__ import annotations
 
@@ -13,48 +13,55 @@ import numpy as np
 from aeropend_ident.tables import clock
 from aeropend_ident.tables.clock import ClockError, Dated
 from aeropend_ident.tables.table import Column, Floats, Ints, Table, TableError, many
-from aeropend_ident.tables.units import CLOCK, TURN, UNITS, Unit, UnitError, known, parse, told
+from aeropend_ident.tables.units import CLOCK, TURN, UNITS, Unit, UnitError, known, listed, parse
 
 CHANNELS = {"theta": "theta", "omega": "omega", "current": "i_a", "voltage": "v_a", "duty": "duty"}
-"""What a user calls a quantity -> the channel of a recording."""
+"""Quantity (name of the option) -> channel of a recording."""
 
 SHOWN_IN = {"theta": ("deg", 180.0 / math.pi), "omega": ("rad/s", 1.0), "current": ("A", 1.0), "voltage": ("V", 1.0),
             "duty": ("%", 100.0), "reference": ("deg", 180.0 / math.pi)}
-"""Units in which ranges are told."""
+"""Unit and factor for the ranges in messages."""
 
 CLIPPED = 0.005
-"""By how much a duty may be outside 0..1."""
+"""Amount by which a duty may be outside 0..1; it is clipped (choice)."""
 
 REST = 1.0
-"""s at the start or the end in which the arm is to be at rest, for `zero`."""
+"""[s] Time at the start or the end in which the arm must be at rest, for `zero` (choice)."""
 
 STILL = math.radians(3.0)
-"""Range of the angle of an arm at rest, rad."""
+"""[rad] Greatest range of the angle of an arm at rest (choice)."""
 
 SLOW, FAST = 10.0, 2e4
-"""Hz below and above which it is said that a recording is slow, or its time in doubt."""
+"""[Hz] Rates below and above which a note warns that the recording is slow, or that the unit of the time may be wrong
+(choices)."""
 
 FAR = 2.0 * TURN
-"""rad from hanging beyond which an angle is in doubt."""
+"""[rad] Angle from hanging above which a note warns that unit or zero may be wrong (choice)."""
 
 LATEST = float(2**31)
-"""s that a stamp can hold."""
+"""[s] Greatest stamp: builtin_interfaces/Time has 32 bits with sign."""
 
 _ZERO = re.compile(r"^([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([^\d\s].*)?$")
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What the columns of a table are, as a person says it.
+    """The user's plan for the columns of a table. A column is given as "COLUMN" or "COLUMN:UNIT".
 
     Attributes:
-        time, theta, duty, omega, current, voltage, reference: "COLUMN" or "COLUMN:UNIT".
-        rate: of the rows, Hz, where no column tells the time.
+        time: column of the time.
+        theta: column of the arm's angle.
+        duty: column of the duty.
+        omega: column of the rotor's speed.
+        current: column of the motor's current.
+        voltage: column of the motor's voltage.
+        reference: column of the reference.
+        rate: [Hz] rate of the rows, without a column of the time.
         zero: the reading of the hanging arm: "-83", "-83deg", "start" or "end".
-        flip: the reading falls when the arm is lifted.
-        motor_off: the duty is 0 all the time.
+        flip: the reading decreases when the arm is lifted.
+        motor_off: the duty is always 0.
         clock: one of `clock.CLOCKS`.
-        skip_bad: leave rows out that cannot be read.
+        skip_bad: skip rows that cannot be read.
     """
 
     time: str | None = None
@@ -72,7 +79,7 @@ class Plan:
     skip_bad: bool = False
 
     def columns(self) -> dict[str, str]:
-        """Quantity -> what is said of it."""
+        """Quantity -> the column that is given for it."""
         return {name: said for name in UNITS if (said := getattr(self, name)) is not None}
 
 
@@ -81,14 +88,14 @@ class Samples:
     """The samples of a rig, on their stamps.
 
     Attributes:
-        stamp_ns: (N,) instants of sampling, rising, ns.
-        channels: theta, omega, i_a, v_a, duty, as far as they were measured -> (N,) SI; NaN where a reading is missing.
-        reference: (N,) rad or rad/s, or None.
-        rows: how many of the N are rows of the table.
-        period: s between samples.
-        mapping: what was taken for what, one line each.
-        notes: what was noticed and repaired, one line each.
-        left_out: columns that nothing was taken from.
+        stamp_ns: [ns] (N,) times of sampling, rising.
+        channels: (N,) each [SI], those measured of theta, omega, i_a, v_a, duty; NaN if a reading is missing.
+        reference: [rad or rad/s] (N,), or None.
+        rows: number of samples that are rows of the table.
+        period: [s] between samples.
+        mapping: the column of each quantity, one line each.
+        notes: warnings and repairs, one line each.
+        left_out: the unused columns.
     """
 
     stamp_ns: Ints
@@ -102,10 +109,14 @@ class Samples:
 
 
 def samples(table: Table, plan: Plan) -> Samples:
-    """Take the samples of a rig from a table.
+    """Convert a table to the samples of a rig.
+
+    Args:
+        table: the table.
+        plan: the user's plan for its columns.
 
     Raises:
-        TableError: that is not possible; one line that says why.
+        TableError: the conversion is not possible; one line with the reason.
     """
     if plan.time is None and plan.rate is None:
         raise TableError(no_time(table))
@@ -157,13 +168,13 @@ def samples(table: Table, plan: Plan) -> Samples:
     used = {k for k, _ in chosen.values()}
     return Samples(
         stamp_ns=stamps, channels=channels, reference=reference, rows=dated.measured, period=dated.period,
-        mapping=tuple(_told(table, plan, chosen, channels, reference)), notes=tuple(notes),
+        mapping=tuple(_described(table, plan, chosen, channels, reference)), notes=tuple(notes),
         left_out=tuple(table.label(k) for k in range(len(table.columns)) if k not in used),
     )
 
 
 def _doubts(table: Table, chosen: dict[str, tuple[int, Unit]], channels: dict[str, Floats], dated: Dated) -> list[str]:
-    """What may be a mistake of the person, one line each."""
+    """Warnings of probable mistakes of the user, one line each."""
     notes = []
     rate = 1.0 / float(np.median(np.diff(dated.time[dated.rows >= 0])))
     if rate > FAST:
@@ -181,13 +192,21 @@ def _doubts(table: Table, chosen: dict[str, tuple[int, Unit]], channels: dict[st
 
 
 def no_time(table: Table) -> str:
-    """Why a table without a time is no recording."""
+    """Message on a table without a time."""
     return (f"{table.path}: no time: give --time COLUMN, or --rate HZ for evenly spaced rows; a table of steady states "
             f"({many(len(table), 'row')}) is no recording, but bench_test takes it")
 
 
 def find(table: Table, text: str) -> list[tuple[int, str]]:
-    """Columns that "COLUMN" or "COLUMN:UNIT" may mean, with the unit, the longest name first."""
+    """Columns that an option may mean; longer names are tried first.
+
+    Args:
+        table: the table.
+        text: "COLUMN" or "COLUMN:UNIT".
+
+    Returns:
+        Number of each column, from 0, and the unit.
+    """
     places = [len(text), *(k for k in range(len(text) - 1, 0, -1) if text[k] == ":")]
     for k in places:
         name, unit = text[:k].strip(), text[k + 1 :].strip()
@@ -209,7 +228,7 @@ def _bare(column: Column) -> str:
 
 
 def _plain(text: str) -> str:
-    """Letters without case, accents and repeated blanks."""
+    """The text in lower case, without accents and repeated blanks."""
     letters = unicodedata.normalize("NFKD", " ".join(text.casefold().split()))
     return "".join(letter for letter in letters if not unicodedata.combining(letter))
 
@@ -236,7 +255,7 @@ def _chosen(table: Table, quantity: str, text: str) -> tuple[int, Unit]:
         unit = known(quantity, column.unit) if column.unit else None
         if unit is None:
             raise TableError(f"{table.path}: {option}: say the unit of column {table.label(k)}, as in "
-                             f"--{quantity} '{text}:{next(iter(UNITS[quantity]))}'; known: {told(quantity)}")
+                             f"--{quantity} '{text}:{next(iter(UNITS[quantity]))}'; known: {listed(quantity)}")
         return k, parse(quantity, unit)
     try:
         return k, parse(quantity, said)
@@ -245,7 +264,7 @@ def _chosen(table: Table, quantity: str, text: str) -> tuple[int, Unit]:
 
 
 def _readable_rows(table: Table, used: list[int], plan: Plan, notes: list[str]) -> Ints:
-    """The rows that can be read, in all the columns that are used."""
+    """The rows that can be read in all used columns."""
     complaints = [(int(table.bad[0]), table.complaint)] if len(table.bad) else []
     columns = [table.columns[k] for k in used]
     complaints += [(int(column.bad[0]), column.complaint) for column in columns if len(column.bad)]
@@ -279,7 +298,7 @@ def _date(table: Table, plan: Plan, chosen: dict[str, tuple[int, Unit]], keep: I
 
 
 def _repeats(table: Table) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Rows that repeat the one before to the last cell."""
+    """Whether each row is equal to the row before."""
     same = np.ones(len(table), dtype=bool)
     same[:1] = False
     for column in table.columns:
@@ -289,13 +308,13 @@ def _repeats(table: Table) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
 
 
 def _placed(dated: Dated, keep: Ints, values: Floats) -> Floats:
-    """Values of rows on the samples, NaN where nothing was measured."""
+    """Values of the samples; NaN for a sample without a row."""
     return np.where(dated.rows >= 0, values[keep][dated.rows], np.nan)
 
 
 def _angle(table: Table, chosen: tuple[int, Unit], raw: Floats, dated: Dated, plan: Plan, notes: list[str]
            ) -> tuple[Floats, float, float]:
-    """The angle from hanging, what is subtracted from readings in rad, and their sign."""
+    """The angle from hanging [rad], the offset of the readings [rad], and their sign."""
     unit = chosen[1]
     read = unit.size * raw
     known_ = np.flatnonzero(np.isfinite(read))
@@ -315,7 +334,7 @@ def _angle(table: Table, chosen: tuple[int, Unit], raw: Floats, dated: Dated, pl
 
 
 def _zero(table: Table, text: str, unit: Unit, read: Floats, dated: Dated) -> float:
-    """The reading of the hanging arm, rad."""
+    """[rad] The reading of the hanging arm."""
     if text in ("start", "end"):
         near = dated.time <= dated.time[0] + REST if text == "start" else dated.time >= dated.time[-1] - REST
         part = read[near & np.isfinite(read)]
@@ -356,9 +375,9 @@ def _duty(table: Table, chosen: tuple[int, Unit], raw: Floats, notes: list[str])
     return np.clip(duty, 0.0, 1.0)
 
 
-def _told(table: Table, plan: Plan, chosen: dict[str, tuple[int, Unit]], channels: dict[str, Floats],
+def _described(table: Table, plan: Plan, chosen: dict[str, tuple[int, Unit]], channels: dict[str, Floats],
           reference: Floats | None) -> list[str]:
-    """What was taken for what, with ranges."""
+    """The column of each quantity with its range, one line each."""
     lines = []
     if plan.time is None:
         lines.append(f"time: {plan.rate:g} rows a second, as you say")

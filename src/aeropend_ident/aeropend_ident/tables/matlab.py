@@ -3,8 +3,8 @@
 
     python -m aeropend_ident.tables.matlab FILE >variables.npz
 
-A damaged file may crash what reads it, or keep it busy for ever; here that harms nobody. What it may take of the
-machine is limited. Exit code 2 with one line on standard error where the file cannot be read.
+A damaged file may crash or block the library that reads it. In a process of its own this does no harm; its memory and
+CPU time are limited. Exit code 2 with one line on standard error: the file cannot be read.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from aeropend_ident.tables.files import HDF5, MOST_UNPACKED, Arrays
 from aeropend_ident.tables.table import MOST_NUMBERS, TableError, check_size
 
 DEEPEST = 4
-"""Structures within structures."""
+"""Greatest depth of nested structures (choice)."""
 
 MOST_MEMORY = 6 << 30
-"""Bytes of memory that this program may take."""
+"""[bytes] Limit of the memory of this program (choice)."""
 
 MOST_SECONDS = 60
-"""s of computation that it may take."""
+"""[s] Limit of its CPU time (choice)."""
 
 
 def read(path: Path) -> Arrays:
-    """The variables of a file, structures with dots.
+    """The variables of a file; the names of fields of structures have dots.
 
     Raises:
-        TableError: it cannot be read.
+        TableError: the file cannot be read.
     """
     with path.open("rb") as file:
         start = file.read(8)
@@ -47,13 +47,13 @@ def read(path: Path) -> Arrays:
 
 
 def _is_hdf5(path: Path) -> bool:
-    """HDF5 begins anew at 512 bytes where MATLAB has written its head."""
+    """Whether a file is HDF5, which starts at byte 512 after a header of MATLAB."""
     with path.open("rb") as file:
         return file.read(8) == HDF5 or (file.seek(512) == 512 and file.read(8) == HDF5)
 
 
 def _mat(path: Path) -> Arrays:
-    """Up to version 7.2."""
+    """Read a file up to version 7.2."""
     from scipy.io import loadmat
 
     _check_mat(path)
@@ -71,7 +71,7 @@ def _mat(path: Path) -> Arrays:
 
 
 def _check_mat(path: Path) -> None:
-    """Refuse what would unpack to more than fits: each element says its length, compressed ones are tried."""
+    """Refuse a file that is too large when unpacked; compressed elements are unpacked to measure them."""
     unpacked = 0
     with path.open("rb") as file:
         order = "big" if file.read(128)[126:128] == b"MI" else "little"
@@ -88,7 +88,7 @@ def _check_mat(path: Path) -> None:
 
 
 def _unpacked(file: io.BufferedReader, length: int, most: int) -> int:
-    """Bytes that compressed data would take, as far as `most` and a bit."""
+    """[bytes] Unpacked size of compressed data; the count ends soon after `most`."""
     unzip = zlib.decompressobj()
     total = 0
     while length > 0 and total <= most:
@@ -118,7 +118,7 @@ def _flat(tree: Mapping[str, Any], prefix: str = "", depth: int = 0) -> Iterator
 
 
 def _hdf5(path: Path) -> Arrays:
-    """Version 7.3, which is HDF5 with its arrays transposed."""
+    """Read a file of version 7.3, which is HDF5 with transposed arrays."""
     try:
         import h5py
     except ImportError:
@@ -130,7 +130,7 @@ def _hdf5(path: Path) -> Arrays:
     def walk(group: Any, prefix: str, depth: int) -> None:
         nonlocal total
         for name in group:
-            # links may lead out of the file
+            # links may point to other files
             if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
                 continue
             one = group[name]
@@ -170,7 +170,7 @@ def main() -> int:
     arrays: dict[str, Any] = {f"a{k}": array if array.dtype.kind in "biuf" else np.zeros(0)
                               for k, array in enumerate(found.values())}
     arrays["names"] = np.frombuffer(json.dumps(list(found)).encode(), dtype=np.uint8)
-    out = io.BytesIO()  # an archive needs a file that can be sought
+    out = io.BytesIO()  # an archive needs a seekable file
     np.savez(out, **arrays)
     sys.stdout.buffer.write(out.getbuffer())
     return 0

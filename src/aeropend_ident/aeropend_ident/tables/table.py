@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A table as it was read: columns of numbers, and what was noticed on the way."""
+"""A table: columns of numbers, with notes on the reading of the file."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 MOST_BYTES = 1 << 30
-"""Size of a file from which on it is refused."""
+"""[bytes] Greatest size of a file (choice)."""
 
 MOST_NUMBERS = 50_000_000
-"""Rows times columns from which on a table is refused: 400 MB in memory."""
+"""Greatest number of rows times columns: 400 MB in memory (choice)."""
 
 MOST_COLUMNS = 1000
+"""Greatest number of columns (choice)."""
 
 SHOWN = 3
-"""First cells of a column that are kept as they were written."""
+"""Number of cells of a column that are kept as text, to show them."""
 
 
 class TableError(ValueError):
-    """A table cannot be used; the message is one line for a person."""
+    """A table cannot be used; the message is one line for the user."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,13 +34,13 @@ class Column:
     """One column.
 
     Attributes:
-        name: what the file calls it, its unit included; "" where it has no name.
-        values: (N,) numbers, in the unit of the file; NaN where a cell is empty or cannot be read.
-        unit: what the file says the unit is; "" where it does not.
-        is_clock: the cells are times of day or dates, and the values s.
-        shown: the first cells that are not empty, as they were written.
-        bad: (K,) rows whose cell holds something that is no number.
-        complaint: the first of them, in one line that says where and what.
+        name: its name in the file, with its unit; "" without a name.
+        values: (N,) numbers in the unit of the file; NaN if a cell is empty or cannot be read.
+        unit: the unit in the file; "" without one.
+        is_clock: the cells are times of day or dates; the values are in s.
+        shown: text of the first cells that are not empty.
+        bad: (K,) rows whose cell is not a number.
+        complaint: message on the first of these rows, one line.
     """
 
     name: str
@@ -52,7 +53,7 @@ class Column:
 
     @property
     def is_text(self) -> bool:
-        """Whether it holds hardly any number."""
+        """Whether more than half of the cells are not numbers."""
         return len(self.bad) > 0.5 * max(len(self.values), 1)
 
 
@@ -63,11 +64,11 @@ class Table:
     Attributes:
         path: the file.
         columns: from left to right.
-        lines: (N,) where each row is in the file, from 1 on: its line, or its row in a sheet or an array.
-        lengths: (N,) characters of each row, where it is text.
-        bad: (K,) rows that do not fit the table, with other numbers of cells.
-        complaint: the first of them, in one line.
-        notes: what was noticed while reading, one line each.
+        lines: (N,) position of each row in the file, from 1: line, or row of a sheet or an array.
+        lengths: (N,) number of characters of each row; None if the file is not text.
+        bad: (K,) rows with a different number of cells.
+        complaint: message on the first of these rows, one line.
+        notes: on the reading of the file, one line each.
     """
 
     path: Path
@@ -83,21 +84,32 @@ class Table:
         return len(self.lines)
 
     def label(self, number: int) -> str:
-        """What a person calls a column, by its number from 0 on: '2 "angle [deg]"', or just '2'."""
+        """Text for a column (number from 0) in a message: '2 "angle [deg]"', or '2' without a name."""
         name = self.columns[number].name
         return f'{number + 1} "{name}"' if name else f"{number + 1}"
 
 
 def many(number: int, what: str, plural: str = "") -> str:
-    """A number of things: '1 row', '3 rows'."""
+    """A number with its noun: '1 row', '3 rows'.
+
+    Args:
+        number: of things.
+        what: singular of the noun.
+        plural: plural of the noun; "": the singular with an s.
+    """
     return f"{number} {what}" if number == 1 else f"{number} {plural or what + 's'}"
 
 
 def check_size(rows: int, columns: int, path: Path) -> None:
-    """Refuse what would not fit in memory.
+    """Refuse a table that is too large for the memory.
+
+    Args:
+        rows: number of rows.
+        columns: number of columns.
+        path: the file, for the message.
 
     Raises:
-        TableError: too large.
+        TableError: it is too large.
     """
     if columns > MOST_COLUMNS:
         raise TableError(f"{path}: has {columns} columns, more than {MOST_COLUMNS}: it is no recording of one rig")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables in text files: CSV in all its dialects, TSV, columns between blanks.
 
-What the dialect is (encoding, delimiter, decimal mark, header, units) is told from the first lines; a number that fits
-it nowhere is never guessed. Cells are read line by line, so a file takes no more memory than its numbers.
+The first lines determine the dialect: encoding, delimiter, decimal mark, header and units. Ambiguous numbers are
+refused, not guessed. Cells are read line by line, so a file takes no more memory than its numbers.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from aeropend_ident.tables.table import MOST_BYTES, SHOWN, Column, Floats, Table
 from aeropend_ident.tables.units import is_unit, split_name, without_brackets
 
 SAMPLE = 400
-"""Lines from which the dialect is told."""
+"""Number of lines that determine the dialect (choice)."""
 
 LONGEST = 1 << 16
-"""Characters of a line from which on the file is no table."""
+"""[characters] Greatest length of a line (choice)."""
 
 BLOCK = 1 << 20
-"""Bytes that are decoded at once to find the encoding."""
+"""[bytes] Size of the blocks that are decoded to find the encoding (choice)."""
 
 DELIMITERS = (";", "\t", "|", ",", " ")
-"""By preference, where several fit; " " stands for any blanks."""
+"""Delimiters in order of preference if several fit; " " means any number of blanks."""
 
 NAMES = {";": "semicolons", "\t": "tabs", "|": "bars", ",": "commas", " ": "blanks"}
 
 EMPTY = {"", "nan", "na", "n/a", "#n/a", "#nv", "null", "none", "-", "--", "inf", "+inf", "-inf", "ovf", "-nan", "?"}
-"""What stands for no reading, in small letters."""
+"""Texts for a missing reading, in lower case."""
 
 COMMENTS = ("#", "%", "//")
 
 ARROW = " -> "
-"""What the Arduino IDE puts between the time at which a line came and the line."""
+"""Text of the Arduino IDE between the time of arrival of a line and the line."""
 
 READABLE = 0.6
-"""Share of the cells in the sample that a dialect must be able to read."""
+"""Least share of readable cells in the sample, for a table of one column (choice)."""
 
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?$")
 _COMMA_NUMBER = re.compile(r"[+-]?(?:\d+(?:,\d+)?|,\d+)(?:[eE][+-]?\d+)?$")
@@ -81,7 +81,7 @@ class Dialect:
 
 
 def number(cell: str, decimal: str) -> float | None:
-    """A number as it is written with this decimal mark; NaN for an empty cell; None for anything else."""
+    """A cell as a number with this decimal mark; NaN for an empty cell; None for other text."""
     cell = cell.strip()
     if (_NUMBER if decimal == "." else _COMMA_NUMBER).match(cell):
         return float(cell.replace(",", "."))
@@ -89,7 +89,7 @@ def number(cell: str, decimal: str) -> float | None:
 
 
 def clock(cell: str) -> float | None:
-    """A time of day or a date with one, s (since 1970 where there is an ISO date); None for anything else."""
+    """[s] A time of day, since 1970 with an ISO date; None for other text."""
     cell = cell.strip()
     minutes = _MINUTES.match(cell)
     if minutes:
@@ -104,7 +104,7 @@ def clock(cell: str) -> float | None:
         try:
             day = datetime.strptime(date, "%Y-%m-%d").replace(tzinfo=timezone.utc)
         except ValueError:
-            return seconds  # the day does not matter: that the clock passes midnight is seen
+            return seconds  # the day is not needed: midnight is found by the wrap of the clock
         return day.timestamp() + seconds
     return seconds
 
@@ -156,7 +156,7 @@ def _encoding(path: Path) -> tuple[str, list[str]]:
 
 
 def _lines(path: Path, encoding: str) -> Iterator[str]:
-    """The lines of a file without their ends."""
+    """The lines of a file without line ends."""
     with path.open(encoding=encoding, errors="replace") as file:
         number = 0
         while line := file.readline(LONGEST + 1):
@@ -187,12 +187,12 @@ def _readable(cell: str, decimal: str) -> bool:
 
 
 def _has_thousands(cell: str) -> bool:
-    """Whether a number marks thousands and cannot be meant otherwise."""
+    """Whether a number has marks of thousands and cannot be read otherwise."""
     return bool(_THOUSANDS.match(cell)) and number(cell, ".") is None and number(cell, ",") is None
 
 
 def _dialect(path: Path, sample: Sequence[str], delimiter: str | None, decimal: str | None) -> Dialect:
-    """Tell delimiter, decimal mark and width from the sample: those with which most cells can be read."""
+    """Find delimiter, decimal mark and width: those with which most cells of the sample can be read."""
     lines = [line for line in sample if line.strip() and not _is_comment(line)]
     if not lines:
         raise TableError(f"{path}: the file is empty")
@@ -269,7 +269,7 @@ def _is_data(row: Sequence[str], dialect: Dialect, texts: Sequence[bool]) -> boo
 
 
 def _commented(lines: Sequence[str], dialect: Dialect) -> list[str]:
-    """Names in a comment or between blanks; none where their number does not fit."""
+    """Names in a comment or between blanks; none if their number does not fit."""
     for line in reversed([line for line in lines if line.strip()][-2:]):
         text = line.strip().lstrip("#%/").strip()
         for names in (split(text, dialect.delimiter), re.split(r"\s{2,}|\t", text), _WORDS.findall(text)):
@@ -280,7 +280,7 @@ def _commented(lines: Sequence[str], dialect: Dialect) -> list[str]:
 
 @dataclass
 class _Store:
-    """One column while it is read."""
+    """A column during reading."""
 
     values: array[float] = field(default_factory=lambda: array("d"))
     bad: list[int] = field(default_factory=list)

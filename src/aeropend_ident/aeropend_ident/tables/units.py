@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the numbers of a table mean: quantities, their units in the spellings of many languages, and sizes in SI."""
+"""Units of the quantities in a table: spellings in many languages, and factors to SI."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TURN = 2.0 * math.pi
 RPM = TURN / 60.0
 
 CLOCK = "clock"
-"""The unit of a time of day or a date; the values are s already."""
+"""The unit of a time of day or a date, whose values are in s."""
 
 ANGLES = {
     "deg": DEGREE, "rad": 1.0, "turn": TURN, "mrad": 1e-3, "°": DEGREE, "º": DEGREE, "degree": DEGREE,
@@ -43,10 +43,10 @@ UNITS: dict[str, dict[str, float]] = {
     "voltage": {"V": 1.0, "mV": 1e-3, "volt": 1.0, "volts": 1.0, "в": 1.0, "мв": 1e-3},
     "reference": {**ANGLES, **SPEEDS},
 }  # fmt: skip
-"""Quantity -> unit -> its size in SI; the units in Latin letters that come first are those that are told to users."""
+"""Quantity -> unit -> its factor to SI. Messages list the first units of each quantity."""
 
-TOLD = {"time": 8, "theta": 4, "duty": 3, "omega": 5, "current": 3, "voltage": 2, "reference": 4}
-"""How many units of each quantity are told."""
+LISTED = {"time": 8, "theta": 4, "duty": 3, "omega": 5, "current": 3, "voltage": 2, "reference": 4}
+"""Number of units of each quantity that messages list."""
 
 COUNTED = ("theta", "duty", "reference")
 """Quantities that may be given in counts."""
@@ -60,18 +60,18 @@ _TAIL = re.compile(r"^(.*[^_\s])_(deg|rad|rpm|ms|us|sec|s|mA|A|mV|V|pct|percent|
 
 
 class UnitError(ValueError):
-    """A unit is not known; the message is part of a line for a person."""
+    """A unit is unknown; the message is part of a line for the user."""
 
 
 @dataclass(frozen=True)
 class Unit:
-    """What a number of a table means: SI value = (number - low) * size.
+    """Conversion of a number in a table: SI value = (number - low) * size.
 
     Attributes:
-        text: as a user would write it.
-        size: of one in the table, SI.
-        low: the number that stands for zero.
-        is_speed: a reference that is a speed (rad/s), not an angle.
+        text: the unit as the user writes it.
+        size: factor to SI.
+        low: the number that means zero.
+        is_speed: the unit of a reference is one of speed, not of angle.
     """
 
     text: str
@@ -81,7 +81,7 @@ class Unit:
 
 
 def known(quantity: str, text: str) -> str | None:
-    """The unit of a quantity that is spelled like this, in the spelling of `UNITS`; None when there is none."""
+    """The unit of a quantity with this spelling, as in `UNITS`; None if it is unknown."""
     text = text.strip()
     units = UNITS[quantity]
     if text in units:
@@ -91,12 +91,16 @@ def known(quantity: str, text: str) -> str | None:
 
 
 def parse(quantity: str, text: str) -> Unit:
-    """Read a unit: `deg`, `0.1deg` (one in the table is 0.1 degrees), `counts:1024`, `counts:1000..2000`.
+    """Read a unit: `deg`, `0.1deg` (the number 1 is 0.1 degrees), `counts:1024`, `counts:1000..2000`.
 
-    Counts of an angle are those of a full turn; of a duty, those of full duty, or those of none and of full.
+    For an angle, the counts are those of a full turn. For a duty, they are those of duty 1, or those of duty 0 and 1.
+
+    Args:
+        quantity: a key of `UNITS`.
+        text: the unit.
 
     Raises:
-        UnitError: it is none of this quantity.
+        UnitError: it is not a unit of this quantity.
     """
     counts = _COUNTS.match(text.strip())
     if counts and quantity in COUNTED:
@@ -116,15 +120,15 @@ def parse(quantity: str, text: str) -> Unit:
         unit = known(quantity, sized.group(2)) if sized else None
         factor = float(sized.group(1)) if sized else 1.0
         if unit is None or factor == 0.0:
-            raise UnitError(f"'{text}' is no unit of {quantity}: give {told(quantity)}")
+            raise UnitError(f"'{text}' is no unit of {quantity}: give {listed(quantity)}")
     if unit == CLOCK and factor != 1.0:
         raise UnitError(f"'{text}': a time of day has no size")
     return Unit(text.strip(), factor * UNITS[quantity][unit], is_speed=unit in SPEEDS and quantity == "reference")
 
 
-def told(quantity: str) -> str:
-    """The units of a quantity, for a person."""
-    names = list(UNITS[quantity])[: TOLD[quantity]]
+def listed(quantity: str) -> str:
+    """Text that lists the units of a quantity."""
+    names = list(UNITS[quantity])[: LISTED[quantity]]
     if quantity == "duty":
         return ", ".join(names) + ", counts:255 (those of full duty) or counts:1000..2000 (of none and of full)"
     return ", ".join(names) + (" or counts:1024 (those of a turn)" if quantity in COUNTED else "")
@@ -134,7 +138,7 @@ def split_name(name: str) -> tuple[str, str]:
     """Split a column's name into name and unit: 'angle [deg]', 'angle (deg)', 'angle / deg', 'angle_deg'.
 
     Returns:
-        The name, and the unit as it is written; "" where it has none that is known.
+        The name, and the unit as in the text; "" without a known unit.
     """
     if is_unit(name):
         return name.strip(), name.strip()
@@ -146,10 +150,10 @@ def split_name(name: str) -> tuple[str, str]:
 
 
 def is_unit(text: str) -> bool:
-    """Whether a word is a unit of any quantity."""
+    """Whether a text is a unit of any quantity."""
     return any(known(quantity, text) is not None for quantity in UNITS) or text.casefold() in ("counts", "lsb", "ticks")
 
 
 def without_brackets(text: str) -> str:
-    """A unit as in a line of units: '[s]', '(deg)', 'V'."""
+    """The unit in a cell of a line of units: '[s]', '(deg)', 'V'."""
     return text.strip().strip("[](){}<>").strip()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Samples as a recording of the contract: joint_states, armature, duty_command and reference, in one MCAP bag."""
+"""Writing of samples as a recording: joint_states, armature, duty_command and reference in an MCAP bag."""
 
 from __future__ import annotations
 
@@ -24,27 +24,27 @@ from aeropend_ident.tables.table import Floats, Ints
 JOINT, BATTERY, FLOAT = "sensor_msgs/msg/JointState", "sensor_msgs/msg/BatteryState", "std_msgs/msg/Float64"
 
 BLOCK = 5000
-"""Samples that are serialized at once."""
+"""Number of samples that are serialized at once (choice)."""
 
 
 class BagExistsError(ValueError):
-    """The recording is there already, or cannot be made."""
+    """The recording exists already."""
 
 
 def write(path: Path, samples: Samples, about: Mapping[str, str],
           progress: Callable[[float], None] | None = None) -> None:
-    """Write a recording; it is there whole, or not at all.
+    """Write a recording; after an error nothing is left of it.
 
-    A sample is received when it is stamped. duty_command and reference are there where they change.
+    The time of reception of a sample is its stamp. duty_command and reference hold a message for each change.
 
     Args:
-        path: folder to make.
-        samples: what was measured.
-        about: where it comes from, kept in the bag's metadata.
-        progress: told the share that is done.
+        path: folder of the recording.
+        samples: the samples.
+        about: origin of the recording, for the metadata of the bag.
+        progress: gets the share that is done.
 
     Raises:
-        BagExistsError: there is something at `path`.
+        BagExistsError: `path` exists already.
         OSError: it cannot be written.
     """
     try:
@@ -88,7 +88,7 @@ def _fill(writer: BagWriter, samples: Samples, progress: Callable[[float], None]
         for topic, values in changes.items():
             rows[topic] = encode(templates[FLOAT], FLOAT, {"data": values[part]})
         for k, stamp in enumerate(stamps.tolist()):
-            for topic in ("/duty_command", "/reference"):  # before the sample in which they show
+            for topic in ("/duty_command", "/reference"):  # before the first sample with the new value
                 if topic in changes and math.isfinite(changes[topic][start + k]):
                     writer.write(entered[topic], stamp, rows[topic][k])
             writer.write(entered["/joint_states"], stamp, rows["/joint_states"][k])
@@ -99,7 +99,7 @@ def _fill(writer: BagWriter, samples: Samples, progress: Callable[[float], None]
 
 
 def _changes(values: Floats) -> Floats:
-    """Values where they differ from the one before, NaN elsewhere."""
+    """(N,) The values that differ from the previous one; NaN elsewhere."""
     known = np.flatnonzero(np.isfinite(values))
     out = np.full(len(values), np.nan)
     new = known[np.concatenate(([True], np.diff(values[known]) != 0.0))] if len(known) else known
@@ -126,7 +126,7 @@ def _armature(stamps: Ints, channels: Mapping[str, Floats], part: slice) -> dict
 
 @lru_cache(maxsize=1)
 def _templates() -> tuple[Typestore, dict[str, bytes]]:
-    """The types, and one serialized message of each; what is not measured is NaN."""
+    """The message types, and a serialized message of each with NaN in every field."""
     store = get_typestore(Stores.ROS2_JAZZY)
     header = store.types["std_msgs/msg/Header"](store.types["builtin_interfaces/msg/Time"](0, 0), "")
     nan, cells = math.nan, np.array([], np.float32)
