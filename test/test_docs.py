@@ -2,6 +2,7 @@
 """What the documents say of the code is so."""
 
 import ast
+import inspect
 import re
 from pathlib import Path
 
@@ -11,18 +12,25 @@ from scipy.signal import lfilter
 
 from aeropend_control.laws.registry import LAWS
 from aeropend_control.nodes.controller import settings
-from aeropend_ident.commands import import_table
+from aeropend_ident.commands import identify, import_table
+from aeropend_ident.diagnosis import batch
+from aeropend_ident.diagnosis.document import schema
 from aeropend_ident.identification.discrepancy import in_library
 from aeropend_ident.testing import bags, rigs
 from aeropend_sim import record
 from aeropend_sim.cli.completion import commands
 from aeropend_sim.model.effects import CATALOGUE
-from aeropend_sim.model.parameters import SAMPLE_PERIOD, load
+from aeropend_sim.model.parameters import PARAMETERS, SAMPLE_PERIOD, load
+from aeropend_sim.ros import interface
 
 ROOT = Path(__file__).parents[1]
 ROWS = {cells[0].strip(" `"): cells for cells in (line.strip("|").split("|") for line in
         (ROOT / "docs" / "effects.md").read_text(encoding="utf-8").splitlines() if line.startswith("| `"))}
 
+
+INTERFACES = (ROOT / "docs" / "interfaces.md").read_text(encoding="utf-8")
+NAMED = set(re.findall(r"`([\w/-]+)`", INTERFACES))
+"""Names that docs/interfaces.md defines."""
 
 READMES = [*sorted(ROOT.glob("*.md")), ROOT / "firmware" / "README.md", *sorted(ROOT.glob("src/*/README.md")),
            *sorted(ROOT.glob("docs/**/*.md"))]
@@ -59,6 +67,52 @@ def test_a_row_gives_place_parameters_and_units(effect):
     assert place.strip() == effect.place
     assert re.findall(r"`(\w+)` ([^,|]+)", parameters.strip()) == [(n, p.unit) for n, p in effect.parameters.items()]
     assert len(shows.strip()) > 10
+
+
+@pytest.mark.parametrize("effect", CATALOGUE.values(), ids=lambda e: e.id)
+def test_the_equation_of_an_effect_is_that_of_the_catalogue(effect):
+    text = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
+    assert f"- `{effect.id}`: {effect.physics}\n" in text
+
+
+def keys(schema):
+    """All keys of the objects in a JSON schema."""
+    return {key for kind in [schema, *schema.get("$defs", {}).values()] for key in kind.get("properties", {})}
+
+
+def test_the_interfaces_name_every_key_of_a_diagnosis():
+    assert len(keys(schema())) > 50
+    assert sorted(keys(schema()) - NAMED) == []
+
+
+def test_the_interfaces_name_every_key_of_identified_equations():
+    found = re.findall(r'"(\w+)":', inspect.getsource(identify.document))
+    assert len(found) > 15
+    assert sorted(set(found) - NAMED) == []
+
+
+def test_the_interfaces_name_columns_topics_services_and_parameters():
+    topics = {value for name, value in vars(interface).items() if name.isupper() and isinstance(value, str)}
+    wanted = {*batch.COLUMNS, *topics, *(key.partition(".")[2] for key in PARAMETERS)} - {interface.ARMATURE_LOCATION}
+    assert len(wanted) > 40
+    assert sorted(wanted - NAMED) == []
+
+
+FILES = re.compile(r"`((?:src|docs|test|evaluation|firmware|tools)/[\w./-]+)`")
+"""A path of the tree in a document."""
+
+
+@pytest.mark.parametrize("path", READMES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_files_that_a_document_names_are_there(path):
+    named = FILES.findall(path.read_text(encoding="utf-8"))
+    assert [name for name in named if not any((base / name).exists() for base in (ROOT, path.parent))] == []
+
+
+def test_no_source_names_a_document_that_is_not_there():
+    sources = [path for folder in ("src", "test", "evaluation") for path in (ROOT / folder).rglob("*.py")]
+    named = {name for path in sources for name in re.findall(r"\bdocs/[\w/]+\.md", path.read_text(encoding="utf-8"))}
+    assert len(named) > 3
+    assert sorted(name for name in named if not (ROOT / name).exists()) == []
 
 
 def test_links_of_the_readme_lead_somewhere():
