@@ -68,7 +68,7 @@ def ends(rig, graph):
         graph.until(lambda: rig.board.duty == 0, "duty 0")
 
 
-def test_samples_say_what_the_contract_says(rig, graph, ends):
+def test_samples_are_as_the_interfaces_define_them(rig, graph, ends):
     joints, armature, command = ends
     command(0.2)
     graph.until(lambda: armature[-1].percentage == np.float32(51 / 255), "the duty")

@@ -66,7 +66,7 @@ def test_truth_and_clock_are_off_by_default(graph, start):
     assert topics() == expected
 
 
-def test_samples_say_what_the_contract_says(graph, start):
+def test_samples_are_as_the_interfaces_define_them(graph, start):
     start("plant", *parameters(publish_truth=True))
     with (
         graph.listening(JointState, JOINT_STATES) as joints,

@@ -90,7 +90,7 @@ def test_the_graphs_are_the_same_item_by_item(graph):
     for node in ("plant", "bridge"):
         with swap.rig(node, args=remap):
             graphs[node], joints[node], armature[node] = seen(graph, node)
-    del graphs["plant"]["services"][f"{NAMESPACE}/{RESET}"]  # the contract gives it to the plant alone
+    del graphs["plant"]["services"][f"{NAMESPACE}/{RESET}"]  # only the plant has it (docs/interfaces.md)
     assert graphs["bridge"] == graphs["plant"]
     for messages in joints, armature:
         assert shape(messages["bridge"][-1]) == shape(messages["plant"][-1])

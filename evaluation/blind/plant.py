@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A second aeropendulum, written from the equations of the contract and sharing no line with aeropend_sim.
+"""A second aeropendulum, written from the equations of docs/interfaces.md and sharing no line with aeropend_sim.
 
 It makes the recordings of the blind check. The states are integrated by LSODA (scipy), the angle filter with them; the
-pulses of the speed are found on the rotor's angle. Each effect has two forms: `table`, as the contract's section 4
+pulses of the speed are found on the rotor's angle. Each effect has two forms: `table`, as docs/effects.md
 writes it, and `other`, what a real rig may do instead: LuGre friction, a two-state thermal winding, a battery with
 polarisation, Dryden turbulence. `OUTSIDE` holds effects that no catalogue lists.
 """
@@ -307,7 +307,7 @@ def shown(p: Array, y: Array, v: Array) -> dict[str, Array]:
 
 def speed_from_pulses(turned: Array, omega: Array, start: float, tick: float, spikes: float, other: bool,
                       rng: np.random.Generator) -> Array:
-    """Speed as held between pulses, one a revolution (contract section 3), with false captures."""
+    """Speed as held between pulses, one a revolution (docs/interfaces.md), with false captures."""
     n = len(turned)
     t = np.arange(n) * PERIOD
     path = CubicHermiteSpline(t, turned + start, omega)

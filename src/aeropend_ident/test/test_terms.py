@@ -7,7 +7,7 @@ from aeropend_ident.identification.terms import Library, TermError, polynomials,
 VARIABLES = ("theta", "theta_dot", "i_a", "omega", "v_a")
 
 
-def test_the_thesis_library_has_its_31_terms_in_the_order_of_the_contract():
+def test_the_thesis_library_has_its_31_terms_in_the_order_of_the_thesis():
     names = thesis_terms(VARIABLES)
     assert len(names) == len(set(names)) == 31
     assert names[:8] == ["1", *VARIABLES, "theta*theta", "theta*theta_dot"]

@@ -325,7 +325,7 @@ class Replay(Node):
 
 
 def _qos_like(connection: Connection) -> QoSProfile:
-    """RELIABLE as in the contract, which serves every subscriber; latched when the recorded publisher was."""
+    """RELIABLE (docs/interfaces.md), which serves every subscriber; latched when the recorded publisher was."""
     assert isinstance(connection.ext, ConnectionExtRosbag2)
     latched = any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in connection.ext.offered_qos_profiles)
     return QoSProfile(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write arrays as a recording of the contract's section 2, as fast as 35,000 samples ask for."""
+"""Write arrays as a recording (docs/interfaces.md), as fast as 35,000 samples ask for."""
 
 from __future__ import annotations
 
