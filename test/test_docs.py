@@ -108,6 +108,33 @@ def test_files_that_a_document_names_are_there(path):
     assert [name for name in named if not any((base / name).exists() for base in (ROOT, path.parent))] == []
 
 
+def words(path):
+    """The identifiers in a source."""
+    return set(re.findall(r"\w+", path.read_text(encoding="utf-8")))
+
+
+def test_the_method_names_functions_of_the_files_that_it_links_to():
+    method = ROOT / "docs" / "method.md"
+    text = re.sub(r"\s+", " ", method.read_text(encoding="utf-8"))
+    named = re.findall(r"\]\(([^)]+\.py)\)\)?[,:] ((?:`\w+`(?:, )?)+)", text)
+    assert len(named) > 15
+    for target, functions in named:
+        there = words(method.parent / target)
+        assert [name for name in re.findall(r"`(\w+)`", functions) if name not in there] == [], target
+    everywhere = set().union(*(words(method.parent / target) for target, _ in links(method) if target.endswith(".py")))
+    assert [name for name in re.findall(r"`(_?[a-z]+(?:_[a-z]{2,})+)`", text) if name not in everywhere] == []
+
+
+def test_the_glossary_names_what_is_in_the_files_that_it_links_to():
+    glossary = ROOT / "docs" / "glossary.md"
+    text = glossary.read_text(encoding="utf-8")
+    target = dict(re.findall(r"^\[([^]]+)\]: (\S+)$", text, re.MULTILINE))
+    assert [path for path in target.values() if not (glossary.parent / path).exists()] == []
+    named = re.findall(r"\| \[([^]]+)\], `(\w+)` \|", text)
+    assert len(named) > 20
+    assert [(ref, name) for ref, name in named if name not in words(glossary.parent / target[ref])] == []
+
+
 def test_no_source_names_a_document_that_is_not_there():
     sources = [path for folder in ("src", "test", "evaluation") for path in (ROOT / folder).rglob("*.py")]
     named = {name for path in sources for name in re.findall(r"\bdocs/[\w/]+\.md", path.read_text(encoding="utf-8"))}
