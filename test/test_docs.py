@@ -189,6 +189,16 @@ def test_the_readme_is_one_page():
     assert 100 <= len(README.splitlines()) <= 150
 
 
+def test_figures_of_the_readme_are_those_of_the_results():
+    results = (ROOT / "docs" / "results" / "blind.md").read_text(encoding="utf-8")
+    measured = [float(number) for number in re.findall(r"\d+(?:\.\d+)?", results)]
+    trust = README.partition("## How far to trust it\n")[2].partition("\n## ")[0]
+    shown = re.findall(r"(?<![\w.])\d+(?:\.\d+)?", trust)
+    assert len(shown) > 12
+    assert [number for number in shown
+            if float(number) not in [round(one, len(number.partition(".")[2])) for one in measured]] == []
+
+
 def test_a_script_in_the_guide_runs(tmp_path, monkeypatch, capsys):
     """A bag by the name that the script reads."""
     (script,) = re.findall(r"```python\n(.+?)```", GUIDE["python"], re.DOTALL)
