@@ -7,7 +7,7 @@ For scripts:
 
     recording = read("my_bag")
     found = diagnose(recording, "bench")
-    print(found.body["which"]["verdict"], found.augmented.effects)
+    print(found.conclusions.which.verdict, found.augmented.effects)
     print(identify(recording).equations)
 
 The names are imported when they are used, because numba and scipy take long to import.

@@ -13,7 +13,7 @@ import pytest
 from aeropend_ident.bags.recording import Recording
 from aeropend_ident.diagnosis import document
 from aeropend_ident.diagnosis.diagnosis import diagnose
-from aeropend_ident.diagnosis.document import DocumentError, from_json, to_json
+from aeropend_ident.diagnosis.document import Across, DocumentError, from_json, to_json
 from aeropend_ident.diagnosis.results import document as document_of
 from aeropend_ident.signals.from_bag import from_uncalibrated
 from aeropend_ident.testing.rigs import BENCH, recorded
@@ -40,7 +40,7 @@ def free_decay(first, rate=20.0, every=5):
 @cache
 def calibrated():
     found = diagnose(BENCH, [recorded(11, {"coulomb_friction": {}}, duration=16.0)], 2)
-    across = {"bag": "tuesday", "gap": 0.5, "gap_after": 0.1, "floor": 0.01, "closed": None, "low": None, "high": None}
+    across = Across("tuesday", 0.5, 0.1, 0.01, None, None, None)
     return document_of(found, ["monday"], "bench", 1.234, [across])
 
 

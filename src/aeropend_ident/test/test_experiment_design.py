@@ -24,10 +24,9 @@ def signals() -> Signals:
 def test_the_advice_is_parameters_of_excite(signals):
     advice = next_experiment(BENCH, signals, hypothesis(coulomb_friction__accel=0.2),
                              hypothesis(quadratic_drag__k=0.3), ("coulomb_friction", "quadratic_drag"))
-    assert set(advice) == {"why", "excite"}
-    planned = Excitation(**advice["excite"])
+    planned = Excitation(**advice.excite)
     assert planned.duration <= LONGEST
-    assert all(name in advice["why"] for name in ("coulomb_friction", "quadratic_drag", "theta"))
+    assert all(name in advice.why for name in ("coulomb_friction", "quadratic_drag", "theta"))
 
 
 @pytest.mark.parametrize(("first", "second"), [
@@ -38,10 +37,10 @@ def test_the_advice_is_parameters_of_excite(signals):
 ])
 def test_what_is_the_same_in_every_equation_is_to_be_measured_directly(signals, first, second):
     advice = advise(BENCH, signals, first, [second])
-    assert advice["excite"] == {}
+    assert advice.excite == {}
     number = second[0].partition(":")[2]
-    assert f"measure {number} (" in advice["why"]
-    assert first[0] in advice["why"]
+    assert f"measure {number} (" in advice.why
+    assert first[0] in advice.why
 
 
 def test_what_numbers_within_their_uncertainty_can_take_over_is_no_difference(signals):
@@ -50,14 +49,14 @@ def test_what_numbers_within_their_uncertainty_can_take_over_is_no_difference(si
     shifted = {**friction, "k_thrust": 1.02 * friction["k_thrust"], "R_a": 0.98 * friction["R_a"]}
     a, b = (free_run(BENCH, signals, values)["theta"] for values in (friction, shifted))
     assert np.sqrt(np.mean((a - b) ** 2)) > 2.0 * signals.sigma["theta"]
-    assert next_experiment(BENCH, signals, friction, shifted, ("coulomb_friction", "coulomb_friction"))["excite"] == {}
+    assert next_experiment(BENCH, signals, friction, shifted, ("coulomb_friction", "coulomb_friction")).excite == {}
 
 
 def test_a_small_difference_takes_a_longer_experiment(signals):
     def duration(tau: float) -> float:
         advice = next_experiment(BENCH, signals, hypothesis(thrust_lag__tau=tau), hypothesis(encoder_lag__tau=tau / 2),
                                  ("thrust_lag", "encoder_lag"))
-        return Excitation(**advice["excite"]).duration
+        return Excitation(**advice.excite).duration
 
     assert duration(0.06) == 60.0
     assert 60.0 < duration(0.02) <= LONGEST
@@ -67,7 +66,7 @@ def test_an_effect_at_its_neutral_size_is_no_part_of_a_hypothesis(signals):
     one, other = hypothesis(thrust_lag__tau=0.06), hypothesis(encoder_lag__tau=0.03)
     names = ("thrust_lag", "encoder_lag")
     plain = next_experiment(BENCH, signals, one, other, names)
-    assert plain["excite"]
+    assert plain.excite
     assert next_experiment(BENCH, signals, {**one, "encoder_lag.tau": 0.0}, {**other, "thrust_lag.tau": 0.0},
                            names) == plain
 
@@ -77,8 +76,8 @@ def test_only_channels_that_were_recorded_count():
     pair = hypothesis(current_gain__gain=0.1), hypothesis(current_offset__bias=0.05)
     names = ("current_gain", "current_offset")
     full, blind = recorded(2, duration=10.0), recorded(2, duration=10.0, without=("i_a",))
-    assert next_experiment(BENCH, full, *pair, names)["excite"]
-    assert next_experiment(BENCH, blind, *pair, names)["excite"] == {}
+    assert next_experiment(BENCH, full, *pair, names).excite
+    assert next_experiment(BENCH, blind, *pair, names).excite == {}
 
 
 def test_one_experiment_for_several_rivals(signals):
@@ -87,8 +86,8 @@ def test_one_experiment_for_several_rivals(signals):
               ("parameter_mismatch:k_thrust", hypothesis(k_thrust=1.2 * BENCH.model["k_thrust"]))]
     first = ("thrust_exponent", hypothesis(thrust_exponent__n=1.8))
     advice = advise(BENCH, signals, first, rivals)
-    assert advice["excite"]
-    distances = [float(text.split()[0]) for text in advice["why"].split(" by ")[1:]]
+    assert advice.excite
+    distances = [float(text.split()[0]) for text in advice.why.split(" by ")[1:]]
     assert len(distances) == len(rivals)
     assert min(distances) > SEPARATE
 
@@ -98,6 +97,6 @@ def test_a_rival_that_no_signal_rules_out_is_said_beside_the_experiment_for_the_
     rivals = [("supply_sag", hypothesis(supply_sag__r_supply=0.4)),
               ("parameter_mismatch:k0", hypothesis(k0=BENCH.model["k0"] - 0.2))]
     advice = advise(BENCH, signals, first, rivals)
-    assert advice["excite"]
-    assert "from supply_sag by" in advice["why"]
-    assert "measure k0 (" in advice["why"]
+    assert advice.excite
+    assert "from supply_sag by" in advice.why
+    assert "measure k0 (" in advice.why

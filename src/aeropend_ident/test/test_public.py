@@ -27,7 +27,7 @@ def test_a_bag_is_read_diagnosed_and_identified_in_three_lines(bag):
     recording = aeropend_ident.read(bag)
     found = aeropend_ident.diagnose(recording, "bench", jobs=2)
     assert isinstance(found, aeropend_ident.Diagnosis)
-    assert found.body["which"]["verdict"] == "coulomb_friction"
+    assert found.conclusions.which.verdict == "coulomb_friction"
     assert "coulomb_friction" in found.augmented.effects
     equations = aeropend_ident.identify(recording).equations
     assert "theta_dot" in equations

@@ -150,8 +150,8 @@ def test_the_gap_on_another_recording_is_that_of_the_identified_model():
                     for k, a in enumerate((1.0, 0.7)))
     found = diagnose(BENCH, [first], 2, fit_nominal=True)
     identified, guessed = (validate(m, found.augmented, other) for m in (found.model, BENCH))
-    assert identified["gap"] < 1.5 * identified["floor"]
-    assert guessed["gap"] > 5.0 * identified["gap"]
+    assert identified.gap < 1.5 * identified.floor
+    assert guessed.gap > 5.0 * identified.gap
 
 
 def test_a_narrow_band_is_worth_few_samples():

@@ -23,6 +23,7 @@ from rich.table import Table
 from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.diagnosis import batch
 from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.document import Across
 from aeropend_ident.diagnosis.results import FILES, Results, document
 from aeropend_ident.diagnosis.validation import validate
 from aeropend_ident.result_folder import OutputError, check
@@ -110,7 +111,7 @@ def run(options: argparse.Namespace, command: str) -> None:
                           for bags in (options.bags, options.test))
         found = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal,
                          progress=lambda what, share: show(share, what))
-        shown = [{"bag": bag, **validate(found.model, found.augmented, s)} for bag, s in zip(options.test, tests)]
+        shown = [Across(bag, **vars(validate(found.model, found.augmented, s))) for bag, s in zip(options.test, tests)]
         made = document(found, options.bags, options.model, time.monotonic() - started, shown)
         results = Results.of(found, made, command)
     results.write(out, overwrite=options.overwrite)

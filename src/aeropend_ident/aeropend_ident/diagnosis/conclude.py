@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The conclusions of a diagnosis as rows of `diagnosis.json`: parameters, candidates, close pairs, next experiment."""
+"""The conclusions of a diagnosis as parts of its document: parameters, candidates, close pairs, next experiment."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,14 @@ from aeropend_ident.diagnosis.chain import nominal_fit
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import OF_THE_ARM, UNCALIBRATED_SD, ZERO, basis, model_parameters
 from aeropend_ident.diagnosis.chain.values import STAGES, neutral, of_rig, with_values
+from aeropend_ident.diagnosis.document import (
+    Candidate,
+    HangingAngle,
+    Identified,
+    Interval,
+    NextExperiment,
+    ParameterRow,
+)
 from aeropend_ident.diagnosis.free_run_gap import HeldOut
 from aeropend_ident.diagnosis.joint_fit import Z95, JointFit
 from aeropend_ident.diagnosis.policy import CALIBRATED, angle_only
@@ -48,17 +56,17 @@ class Statistical:
         return [e for e in (self.gust, self.spikes) if e is not None]
 
 
-def parameter_rows(chains: CutChains, joint: JointFit) -> dict[str, dict[str, object]]:
+def parameter_rows(chains: CutChains, joint: JointFit) -> dict[str, ParameterRow]:
     """The parameters of the model that were refitted.
 
     For an uncalibrated rig all of them, marked by whether the recordings determine them.
     """
     nominal, values, sd = chains.model.model, joint.values, joint.sd
     if chains.policy.calibrated:
-        return {n: {"nominal": nominal[n], **_interval(values[n], sd[n])} for n in MODEL_NAMES if n in values}
+        return {n: _row(nominal[n], _interval(values[n], sd[n])) for n in MODEL_NAMES if n in values}
     fitted = {p.name: p for stage in STAGES for p in model_parameters(chains, stage)}
     alone = angle_only(chains.recordings)
-    rows: dict[str, dict[str, object]] = {}
+    rows: dict[str, ParameterRow] = {}
     for n in MODEL_NAMES:
         limits = PARAMETERS[f"model.{n}"]
         p = fitted.get(n, Parameter(n, nominal[n], UNCALIBRATED_SD, limits.low, limits.high, log=nominal[n] > 0.0))
@@ -69,30 +77,43 @@ def parameter_rows(chains: CutChains, joint: JointFit) -> dict[str, dict[str, ob
         prior = p.sd * (value if p.log else 1.0)
         if p.log and value > 0.0:
             reach = math.exp(Z95 * spread / value)
-            between = {"value": value, "low": max(value / reach, limits.low), "high": min(value * reach, limits.high)}
+            between = Interval(value, max(value / reach, limits.low), min(value * reach, limits.high))
         else:
             between = _interval(value, spread, p.low, p.high)
-        rows[n] = {"nominal": nominal[n], **between, "determined": known and spread < DETERMINED * prior}
-        if known:
-            rows[n] |= _over_recordings(n, values, sd)
+        row = _row(nominal[n], between, known and spread < DETERMINED * prior)
+        own = _over_recordings(n, values, sd) if known else None
+        rows[n] = row if own is None else replace(row, value=own.mean.value, low=own.mean.low, high=own.mean.high,
+                                                  runs=own.runs, run_to_run=own.run_to_run)
     return rows
 
 
-def _over_recordings(name: str, of_all: Mapping[str, float], sd_of_all: Mapping[str, float]) -> dict[str, object]:
+def _row(nominal: float, estimate: Interval, determined: bool | None = None) -> ParameterRow:
+    return ParameterRow(nominal, estimate.value, estimate.low, estimate.high, determined)
+
+
+@dataclass(frozen=True)
+class _OverRecordings:
     """A value that each recording has of its own: mean, values, and their scatter beyond their uncertainty."""
+
+    mean: Interval
+    runs: tuple[Interval, ...]
+    run_to_run: float
+
+
+def _over_recordings(name: str, of_all: Mapping[str, float], sd_of_all: Mapping[str, float]) -> _OverRecordings | None:
+    """The value of each recording; None if they share one."""
     own = sorted((n for n in of_all if key(n).plain == name), key=lambda n: key(n).recording)
     if len(own) < 2:
-        return {}
+        return None
     values, sd = [of_all[n] for n in own], [sd_of_all[n] for n in own]
     spread = math.sqrt(max(float(np.var(values, ddof=1)) - float(np.mean(np.square(sd))), 0.0))
     mean, unsure = float(np.mean(values)), math.sqrt(float(np.var(values, ddof=1)) / len(values))
     unsure = max(unsure, math.sqrt(float(np.sum(np.square(sd)))) / len(sd))
-    return {**_interval(mean, unsure), "runs": [_interval(v, s) for v, s in zip(values, sd, strict=True)],
-            "run_to_run": spread}
+    return _OverRecordings(_interval(mean, unsure),
+                           tuple(_interval(v, s) for v, s in zip(values, sd, strict=True)), spread)
 
 
-def identified_model(chains: CutChains, joint: JointFit, rows: Mapping[str, Mapping[str, object]]
-                     ) -> dict[str, object]:
+def identified_model(chains: CutChains, joint: JointFit, rows: Mapping[str, ParameterRow]) -> Identified:
     """What the nominal model of an uncalibrated rig was identified from.
 
     Args:
@@ -101,17 +122,19 @@ def identified_model(chains: CutChains, joint: JointFit, rows: Mapping[str, Mapp
         rows: of `parameter_rows`.
     """
     recordings, values = chains.recordings, joint.values
-    said: dict[str, object] = {"from": basis(recordings),
-                               "not_determined": [n for n, row in rows.items() if not row["determined"]]}
+    lift, hangs = None, None
     if "k3" in values and angle_only(recordings):
-        said["lift"] = nominal_fit.lift(with_values(chains.model, chains.values_of(values, 0)), recordings)
+        lift = nominal_fit.lift(with_values(chains.model, chains.values_of(values, 0)), recordings)
     if ZERO in values:
-        said["hangs_at"] = _interval(values[ZERO], joint.sd[ZERO]) | _over_recordings(ZERO, values, joint.sd)
-    return said
+        one, own = _interval(values[ZERO], joint.sd[ZERO]), _over_recordings(ZERO, values, joint.sd)
+        mean = one if own is None else own.mean
+        hangs = HangingAngle(mean.value, mean.low, mean.high, own.runs if own else None,
+                             own.run_to_run if own else None)
+    return Identified(basis(recordings), tuple(n for n, row in rows.items() if not row.determined), lift, hangs)
 
 
 def candidates(findings: Mapping[str, Findings], joint: JointFit, statistical: Statistical, held_out: HeldOut,
-               gap_after: float) -> list[dict[str, object]]:
+               gap_after: float) -> tuple[Candidate, ...]:
     """Every hypothesis that was ranked, the most probable first; a found one with its intervals of the joint fit.
 
     Args:
@@ -121,32 +144,27 @@ def candidates(findings: Mapping[str, Findings], joint: JointFit, statistical: S
         held_out: measures gaps.
         gap_after: gap of the augmented model.
     """
-    rows: dict[str, tuple[float, dict[str, object]]] = {}
+    rows: dict[str, Candidate] = {}
     for f in findings.values():
         accepted = {h.name for h in f.effects}
         for selection in f.selections:
             for r in selection:
                 h = r.hypothesis
                 mine = h.name in accepted
-                if h.name in rows and (rows[h.name][0] >= r.probability or mine):
+                if h.name in rows and (rows[h.name].probability >= r.probability or mine):
                     continue
                 if mine and r is not selection[0]:
                     continue
                 source, spread = (joint.values, joint.sd) if mine else (r.fit.values, r.fit.sd)
                 whole = {**joint.values, **r.fit.values}
-                rows[h.name] = r.probability, {
-                    "effect": h.effect, "place": h.place, "probability": r.probability,
-                    "parameters": {key(p.name).name: _interval(source[p.name], spread[p.name], p.low, p.high)
-                                   for p in h.own},
-                    "found": mine,
-                    "gap_after": (gap_after if mine else
-                                  held_out.gap_of(whole).total if r.probability > TRACE else None)}
+                estimates = {key(p.name).name: _interval(source[p.name], spread[p.name], p.low, p.high) for p in h.own}
+                after = gap_after if mine else held_out.gap_of(whole).total if r.probability > TRACE else None
+                rows[h.name] = Candidate(h.effect, h.place, r.probability, estimates, mine, after)
     for extra in statistical.found:
-        rows[extra.hypothesis.name] = extra.probability, {
-            "effect": extra.hypothesis.effect, "place": extra.hypothesis.place, "probability": extra.probability,
-            "parameters": {key(n).name: _interval(v, extra.fit.sd[n], 0.0) for n, v in extra.fit.values.items()},
-            "found": True, "gap_after": gap_after}
-    return [row for _, row in sorted(rows.values(), key=lambda item: -item[0])]
+        h = extra.hypothesis
+        estimates = {key(n).name: _interval(v, extra.fit.sd[n], 0.0) for n, v in extra.fit.values.items()}
+        rows[h.name] = Candidate(h.effect, h.place, extra.probability, estimates, True, gap_after)
+    return tuple(sorted(rows.values(), key=lambda row: -row.probability))
 
 
 def not_separable(findings: Mapping[str, Findings], least: float) -> list[tuple[RankedHypothesis, RankedHypothesis]]:
@@ -168,7 +186,7 @@ def names(first: RankedHypothesis, second: RankedHypothesis) -> tuple[str, str]:
 
 
 def next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[RankedHypothesis, RankedHypothesis]],
-                    values: Mapping[str, float], tried: Sequence[Excitation]) -> dict[str, object] | None:
+                    values: Mapping[str, float], tried: Sequence[Excitation]) -> NextExperiment | None:
     """The experiment that would separate the closest pair; None where nothing is open.
 
     Args:
@@ -181,8 +199,9 @@ def next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[Ranked
     if not pairs:
         return None
     if not signals.driven:
-        return {"why": "release the arm from a larger angle and record until it rests: the decay of the swings shows "
-                       "the kind of friction; drive the arm and record the command as well to see more", "excite": {}}
+        return NextExperiment("release the arm from a larger angle and record until it rests: the decay of the swings "
+                              "shows the kind of friction; drive the arm and record the command as well to see more",
+                              {})
     first, second = max(pairs, key=lambda pair: pair[1].probability)
     own = {p.name: neutral(model, p.name) for r in (first, second) for p in r.hypothesis.own}
     one, other = ({**values, **own, **r.fit.values} for r in (first, second))
@@ -191,5 +210,5 @@ def next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[Ranked
     return experiment_design.next_experiment(model, signals, one, other, names(first, second), tried)
 
 
-def _interval(value: float, sd: float, low: float = -math.inf, high: float = math.inf) -> dict[str, float]:
-    return {"value": value, "low": max(value - Z95 * sd, low), "high": min(value + Z95 * sd, high)}
+def _interval(value: float, sd: float, low: float = -math.inf, high: float = math.inf) -> Interval:
+    return Interval(value, max(value - Z95 * sd, low), min(value + Z95 * sd, high))

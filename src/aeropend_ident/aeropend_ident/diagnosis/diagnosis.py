@@ -9,18 +9,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from aeropend_ident.diagnosis import conclude, regions
+from aeropend_ident.diagnosis import conclude, regions, typed_json
 from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model
 from aeropend_ident.diagnosis.chain.pwm_timing import with_pwm_timing
 from aeropend_ident.diagnosis.chain.values import PLACE_OF_CHANNEL, PLACE_OF_PARAMETER, neutral, of_rig, with_values
 from aeropend_ident.diagnosis.conclude import Statistical
+from aeropend_ident.diagnosis.document import (
+    Channel,
+    Closure,
+    Conclusions,
+    Curve,
+    Residual,
+    UnknownEffect,
+    Where,
+    Which,
+)
 from aeropend_ident.diagnosis.experiment_design import EXPERIMENTS, experiments_within
 from aeropend_ident.diagnosis.free_run_gap import Gap, HeldOut, closure
 from aeropend_ident.diagnosis.joint_fit import JointFit, fit_jointly
@@ -28,7 +39,6 @@ from aeropend_ident.diagnosis.policy import GOOD_ENOUGH, policy_of
 from aeropend_ident.diagnosis.search import gust, speed_spikes, unknown_effect
 from aeropend_ident.diagnosis.search.findings import Findings
 from aeropend_ident.diagnosis.search.search import refit, search
-from aeropend_ident.diagnosis.search.unknown_effect import UnknownEffect
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import CHANNELS, Signals
 from aeropend_ident.signals.statistics import rms
@@ -50,7 +60,7 @@ class Diagnosis:
         signals: the recordings.
         before: channel -> (N,) free-run readings of the nominal model, one a recording.
         after: the same of the augmented model.
-        body: the content of `diagnosis.json` from `channels` on.
+        conclusions: what they show.
         misfit: of the nominal structure where it fits worst.
     """
 
@@ -59,8 +69,13 @@ class Diagnosis:
     signals: Sequence[Signals]
     before: Sequence[Mapping[str, Array]]
     after: Sequence[Mapping[str, Array]]
-    body: dict[str, object]
+    conclusions: Conclusions
     misfit: regions.Misfit
+
+    @property
+    def body(self) -> dict[str, Any]:
+        """The conclusions as in `diagnosis.json`."""
+        return typed_json.to_json(self.conclusions)
 
 
 Progress = Callable[[str, float], None]
@@ -103,7 +118,7 @@ class _Findings:
     chains: CutChains
     stages: Mapping[str, Findings]
     statistical: Statistical
-    unknown: UnknownEffect | None
+    unknown: unknown_effect.UnknownEffect | None
     misfit: regions.Misfit
     recordings: Sequence[Signals]
 
@@ -139,12 +154,12 @@ def _diagnose(fitted: CutChains, jobs: int, progress: Progress) -> Diagnosis:
     found = replace(found, stages=joint.findings)
     progress("measuring the gap", 0.9)
     gaps = _measure(fitted, found, joint)
-    body = _conclude(found, joint, gaps)
+    conclusions = _conclude(found, joint, gaps)
     model, chains = found.chains.model, found.chains
     nominal = model if chains.policy.calibrated else with_values(model, of_rig(gaps.base))
     progress("done", 1.0)
     return Diagnosis(nominal, _augmented(model, joint.values, found.statistical), found.recordings, gaps.runs_before,
-                     gaps.runs_after, body, found.misfit)
+                     gaps.runs_after, conclusions, found.misfit)
 
 
 def _find(fitted: CutChains, jobs: int, progress: Progress) -> _Findings:
@@ -180,8 +195,8 @@ def _measure(fitted: CutChains, found: _Findings, joint: JointFit) -> _Gaps:
                  held_out.floors())
 
 
-def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps) -> dict[str, object]:
-    """The content of `diagnosis.json` from `channels` on."""
+def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps) -> Conclusions:
+    """What the findings, the joint fit and the gaps show."""
     chains, stages, unknown = found.chains, found.stages, found.unknown
     calibrated = chains.policy.calibrated
     candidates = conclude.candidates(stages, joint, found.statistical, gaps.held_out, gaps.after.total)
@@ -193,28 +208,23 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps) -> dict[str, objec
     tried = EXPERIMENTS if calibrated else experiments_within(max(float(s.duty.max()) for s in found.recordings))
     rows = conclude.parameter_rows(chains, joint)
     share, low, high = closure(gaps.before, gaps.after, gaps.floors)
-    body: dict[str, object] = {
-        "channels": {c: {"unit": CHANNELS[c], "gap": gaps.before.rms[c], "floor": gaps.floors[c],
-                         "gap_after": gaps.after.rms[c]} for c in CHANNELS if c in gaps.before.rms},
-        "where": {"place": place, "share": regions.shares((p, amount) for _, p, amount in amounts),
-                  "regions": [vars(r) for r in regions.regions(found.misfit)]},
-        "which": {"verdict": verdict, "effects": effects, "candidates": candidates, "numbers": rows,
-                  "residuals": {channel: {"rms": check.rms[channel], "white": check.white[channel],
-                                          "dependence": check.dependence}
-                                for check in joint.checks.values() for channel in check.rms},
-                  "unexplained": reasons, "unknown": None if unknown is None else _curves(unknown),
-                  "not_separable": [list(conclude.names(a, b)) for a, b in undecided],
-                  "next_experiment": conclude.next_experiment(chains.model, found.recordings[0], undecided,
-                                                              joint.values, tried)},
-        "shrink": {"gap": gaps.before.total, "gap_after": gaps.after.total,
-                   "floor": gaps.before.total_floor(gaps.floors), "closed": share, "low": low, "high": high},
-    }
-    if not calibrated:
-        body["identified"] = conclude.identified_model(chains, joint, rows)
-    return body
+    return Conclusions(
+        channels={c: Channel(CHANNELS[c], gaps.before.rms[c], gaps.floors[c], gaps.after.rms[c])
+                  for c in CHANNELS if c in gaps.before.rms},
+        where=Where(place, regions.shares((p, amount) for _, p, amount in amounts),
+                    tuple(regions.regions(found.misfit))),
+        which=Which(verdict, tuple(effects), candidates, rows,
+                    {channel: Residual(check.rms[channel], check.white[channel], check.dependence)
+                     for check in joint.checks.values() for channel in check.rms},
+                    tuple(reasons), None if unknown is None else _curves(unknown),
+                    tuple(conclude.names(a, b) for a, b in undecided),
+                    conclude.next_experiment(chains.model, found.recordings[0], undecided, joint.values, tried)),
+        closure=Closure(gaps.before.total, gaps.after.total, gaps.before.total_floor(gaps.floors), share, low, high),
+        identified=None if calibrated else conclude.identified_model(chains, joint, rows))
 
 
-def _verdict(amounts: Sequence[tuple[str, str, float]], unknown: UnknownEffect | None) -> tuple[str, str, list[str]]:
+def _verdict(amounts: Sequence[tuple[str, str, float]], unknown: unknown_effect.UnknownEffect | None
+             ) -> tuple[str, str, list[str]]:
     """The verdict, its place, and the effects found, the largest first."""
     ranked = sorted((a for a in amounts if a[0]), key=lambda a: -a[2])
     effects = list(dict.fromkeys(name.partition(":")[0] for name, _, _ in ranked))
@@ -223,10 +233,9 @@ def _verdict(amounts: Sequence[tuple[str, str, float]], unknown: UnknownEffect |
     return (effects[0], ranked[0][1], effects) if ranked else ("none", "none", effects)
 
 
-def _curves(unknown: UnknownEffect) -> dict[str, object]:
-    return {"place": unknown.term.place,
-            "curves": [{"variable": c.variable, "unit": c.unit, "at": c.knot.tolist(), "value": c.value.tolist()}
-                       for c in unknown.term.curves]}
+def _curves(unknown: unknown_effect.UnknownEffect) -> UnknownEffect:
+    return UnknownEffect(unknown.term.place, tuple(
+        Curve(c.variable, c.unit, tuple(c.knot.tolist()), tuple(c.value.tolist())) for c in unknown.term.curves))
 
 
 def _amounts(found: _Findings, values: Mapping[str, float], gaps: _Gaps) -> list[tuple[str, str, float]]:

@@ -353,6 +353,25 @@ class Identified:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Conclusions:
+    """What a diagnosis shows.
+
+    Attributes:
+        channels: channel -> its gap.
+        where: where the gap arises.
+        which: which effect causes it.
+        closure: how far it closes.
+        identified: uncalibrated rigs only.
+    """
+
+    channels: Mapping[str, Channel]
+    where: Where
+    which: Which
+    closure: Closure = field(metadata={"key": "shrink"})
+    identified: Identified | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class DiagnosisDocument:
     """The content of `diagnosis.json`.
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD
 from aeropend_ident.diagnosis.chain.values import clipped
+from aeropend_ident.diagnosis.document import NextExperiment
 from aeropend_ident.diagnosis.free_run_gap import free_run
 from aeropend_ident.estimation.map_fit import DAMPING, DAMPING_DOWN
 from aeropend_ident.estimation.parameter import key
@@ -81,7 +82,7 @@ def experiments_within(top: float) -> tuple[Excitation, ...]:
 
 
 def advise(model: Model, signals: Signals, first: Named, rivals: Sequence[Named],
-           experiments: Sequence[Excitation] = EXPERIMENTS) -> dict[str, object]:
+           experiments: Sequence[Excitation] = EXPERIMENTS) -> NextExperiment:
     """Choose the signal on which a hypothesis differs most from each of its rivals after a refit.
 
     Args:
@@ -90,9 +91,6 @@ def advise(model: Model, signals: Signals, first: Named, rivals: Sequence[Named]
         first: the hypothesis.
         rivals: at least one. An effect at its neutral size is no part of a hypothesis.
         experiments: the signals that are tried.
-
-    Returns:
-        `why` in words, and `excite`: parameters of that node, empty where no signal helps.
     """
     tried = {e: distances(model, signals, first, rivals, e) for e in experiments}
     # a difference grows with the square root of the time
@@ -101,23 +99,22 @@ def advise(model: Model, signals: Signals, first: Named, rivals: Sequence[Named]
     alike = "; ".join(f"{first[0]} and {rivals[k][0]} give the same readings under every signal tried: to separate "
                       f"them, {_directly(model, first, rivals[k])}" for k in range(len(rivals)) if k not in helped)
     if not helped:
-        return {"why": alike, "excite": {}}
+        return NextExperiment(alike, {})
     best = max(experiments, key=lambda e: min(tried[e][k][0] for k in helped))
     shortfall = SEPARATE / max(min(tried[best][k][0] for k in helped), 1e-9)
     if shortfall > 1.0:
         best = replace(best, duration=min(math.ceil(best.duration * shortfall**2 / 30.0) * 30.0, LONGEST))
         tried[best] = distances(model, signals, first, rivals, best)
     default = asdict(Excitation(best.kind))
-    chosen = {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(best).items()
-              if k in ("kind", "duration") or v != default[k]}
+    chosen = {k: v for k, v in asdict(best).items() if k in ("kind", "duration") or v != default[k]}
     texts = [f"from {rivals[k][0]} by {tried[best][k][0]:.0f} standard deviations, most in {tried[best][k][1]}"
              for k in helped]
     why = f"with this signal {first[0]} differs {', '.join(texts)}, after the parameters are refitted"
-    return {"why": f"{why}; {alike}" if alike else why, "excite": chosen}
+    return NextExperiment(f"{why}; {alike}" if alike else why, chosen)
 
 
 def next_experiment(model: Model, signals: Signals, first: Mapping[str, float], second: Mapping[str, float],
-                    names: tuple[str, str], experiments: Sequence[Excitation] = EXPERIMENTS) -> dict[str, object]:
+                    names: tuple[str, str], experiments: Sequence[Excitation] = EXPERIMENTS) -> NextExperiment:
     """As `advise`, for two hypotheses.
 
     Args:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.values import STAGES
+from aeropend_ident.diagnosis.document import Region
 from aeropend_ident.diagnosis.search import gust
 from aeropend_ident.diagnosis.search.findings import Findings
 from aeropend_ident.estimation.map_fit import Fit
@@ -39,25 +40,6 @@ class Misfit:
 
     signal: Array
     variables: Mapping[str, Array]
-
-
-@dataclass(frozen=True)
-class Region:
-    """A range of a variable in which the misfit concentrates.
-
-    Attributes:
-        variable: its name.
-        low: lower end.
-        high: upper end.
-        share: of the squared misfit.
-        time: share of the time.
-    """
-
-    variable: str
-    low: float
-    high: float
-    share: float
-    time: float
 
 
 def shares(amounts: Iterable[tuple[str, float]]) -> dict[str, float]:

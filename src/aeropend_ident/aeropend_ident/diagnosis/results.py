@@ -5,19 +5,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from aeropend_ident.diagnosis.diagnosis import Diagnosis
 from aeropend_ident.diagnosis.document import (
     FORMAT,
+    Across,
     Candidate,
     ClosedGap,
     DiagnosisDocument,
     Identified,
     NextExperiment,
     ParameterRow,
-    from_json,
     to_json,
 )
 from aeropend_ident.diagnosis.report import page
@@ -80,7 +80,7 @@ class Results:
 
 
 def document(diagnosis: Diagnosis, bags: Sequence[str], model: str, seconds: float,
-             across: Sequence[Mapping[str, object]] = ()) -> DiagnosisDocument:
+             across: Sequence[Across] = ()) -> DiagnosisDocument:
     """The document of a diagnosis.
 
     Args:
@@ -93,14 +93,13 @@ def document(diagnosis: Diagnosis, bags: Sequence[str], model: str, seconds: flo
     signals = diagnosis.signals
     duration = sum(len(s) * s.period for s in signals)
     train = sum(s.train * s.period for s in signals)
-    shrink = diagnosis.body["shrink"]
-    assert isinstance(shrink, dict)
-    return from_json({
-        "format": FORMAT, "bags": list(bags), "model": model, "duration_s": round(duration, 3),
-        "samples": sum(s.samples for s in signals), "train_s": [0.0, round(train, 3)],
-        "held_out_s": [round(train, 3), round(duration, 3)], **diagnosis.body,
-        "shrink": {**shrink, "across": list(across)}, "notes": [note for s in signals for note in s.notes],
-        "seconds": round(seconds, 2)})
+    c = diagnosis.conclusions
+    return DiagnosisDocument(
+        format=FORMAT, bags=tuple(bags), model=model, duration_s=round(duration, 3),
+        samples=sum(s.samples for s in signals), train_s=(0.0, round(train, 3)),
+        held_out_s=(round(train, 3), round(duration, 3)), channels=c.channels, where=c.where, which=c.which,
+        closure=replace(c.closure, across=tuple(across)), identified=c.identified,
+        notes=tuple(note for s in signals for note in s.notes), seconds=round(seconds, 2))
 
 
 def verdict_lines(document: DiagnosisDocument) -> list[str]:

@@ -10,6 +10,7 @@ from aeropend_ident.diagnosis import free_run_gap
 from aeropend_ident.diagnosis.chain.chain import difference
 from aeropend_ident.diagnosis.chain.priors import state_of_arm
 from aeropend_ident.diagnosis.chain.values import Values
+from aeropend_ident.diagnosis.document import ClosedGap
 from aeropend_ident.estimation.map_fit import fit
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model.parameters import Model
@@ -20,7 +21,7 @@ FORGOTTEN = 5.0
 """[s] Time after which the arm has forgotten its initial state: some of its time constants."""
 
 
-def validate(model: Model, augmented: Model, signals: Signals) -> dict[str, float | None]:
+def validate(model: Model, augmented: Model, signals: Signals) -> ClosedGap:
     """The gap of a further recording before and after, in free runs from its duty.
 
     The first `FORGOTTEN` seconds, at most half of the recording, only give the initial state; the rest is judged.
@@ -29,9 +30,6 @@ def validate(model: Model, augmented: Model, signals: Signals) -> dict[str, floa
         model: the nominal model.
         augmented: with what other recordings of the rig showed.
         signals: the recording.
-
-    Returns:
-        `gap`, `gap_after`, `floor`, `closed`, `low`, `high`, as `shrink` in `diagnosis.json`.
     """
     start = min(round(FORGOTTEN / signals.period), len(signals) // 2)
     left_out = signals.false_speed if "speed_spikes" in augmented.effects else None
@@ -40,8 +38,7 @@ def validate(model: Model, augmented: Model, signals: Signals) -> dict[str, floa
                      for run, leave in zip(runs, (None, left_out), strict=True))
     floors = free_run_gap.floor(signals, start, len(signals))
     share, low, high = free_run_gap.closure(before, after, floors)
-    return {"gap": before.total, "gap_after": after.total, "floor": before.total_floor(floors), "closed": share,
-            "low": low, "high": high}
+    return ClosedGap(before.total, after.total, before.total_floor(floors), share, low, high)
 
 
 def _initial_state(model: Model, signals: Signals) -> Values:

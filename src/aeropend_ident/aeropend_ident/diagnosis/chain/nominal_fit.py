@@ -28,6 +28,7 @@ from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
 from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
 from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.chain.values import STAGES, of_rig, with_values
+from aeropend_ident.diagnosis.document import Lift
 from aeropend_ident.diagnosis.policy import Policy, angle_only, policy_of
 from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess
 from aeropend_ident.estimation.parameter import Parameter, key
@@ -335,24 +336,20 @@ def _likeliest(model: Model, recordings: Sequence[Signals], tests: Sequence[_Wea
     return sorted(found, key=lambda item: item[0])
 
 
-def lift(model: Model, recordings: Sequence[Signals]) -> dict[str, object]:
+def lift(model: Model, recordings: Sequence[Signals]) -> Lift:
     """The static lift of a duty and its lag: all that command and angle alone show of map, motor and thrust.
 
     Args:
         model: the identified model.
         recordings: give the largest duty.
-
-    Returns:
-        `duty` (K,) up to the largest; `rad_per_s2` (K,) lift over the arm's inertia; `dead_zone`, the duty below which
-        there is none; `lag_s`, the rotor's time constant at half of the largest duty.
     """
     n = model.numbers()
     duty = np.linspace(0.0, max(float(s.duty.max()) for s in recordings), CURVE)
     speed = actuator.speed_at(n, actuator.voltage(n, duty))
     middle = float(speed[CURVE // 2])
-    return {"duty": duty.tolist(), "rad_per_s2": (n["L_over_J"] * actuator.thrust(n, speed)).tolist(),
-            "dead_zone": max(((n["k0"] / n["k1"]) ** 2 - n["k3"]) / n["k2"], 0.0) if n["k0"] < 0.0 else 0.0,
-            "lag_s": n["J_m"] / (n["K_t"] * n["K_e"] / n["R_a"] + 2.0 * n["k_load"] * middle)}
+    return Lift(duty=tuple(duty.tolist()), rad_per_s2=tuple((n["L_over_J"] * actuator.thrust(n, speed)).tolist()),
+                dead_zone=max(((n["k0"] / n["k1"]) ** 2 - n["k3"]) / n["k2"], 0.0) if n["k0"] < 0.0 else 0.0,
+                lag_s=n["J_m"] / (n["K_t"] * n["K_e"] / n["R_a"] + 2.0 * n["k_load"] * middle))
 
 
 def _curve(numbers: Mapping[str, float], dead: float, bend: float, load: float, lag: float) -> dict[str, float]:
