@@ -348,8 +348,9 @@ def test_reasons_for_care(friction, angle_only):
     noted = replace(friction.signals[0], notes=("not measured: v_a", "2 samples are missing in 1 gap"))
     assert "1 note describes" in care(replace(friction, signals=[noted]))
     assert "note" not in care(friction)
-    open_ = {**friction.body["shrink"], "closed": 0.6}
-    assert "Only 60 % of the gap closes" in care(replace(friction, body={**friction.body, "shrink": open_}))
+    conclusions = friction.conclusions
+    open_ = replace(conclusions, closure=replace(conclusions.closure, closed=0.6))
+    assert "Only 60 % of the gap closes" in care(replace(friction, conclusions=open_))
 
 
 def test_a_good_recording_needs_no_care(friction):
