@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from aeropend_sim.cli import aeropend
 from aeropend_sim.cli.completion import commands
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import load, to_flat
@@ -86,6 +87,35 @@ def test_command_lines_of_a_document_are_understood(path, capsys):
         assert [one for one in [*options, *parameters] if one not in told and one not in MODEL] == [], line
 
 
+def test_aeropend_lists_every_command_once(capsys):
+    assert aeropend.main([]) == 0
+    listed = re.findall(r"^  (\w+)  ", capsys.readouterr().out, re.MULTILINE)
+    assert sorted([*listed, "aeropend"]) == sorted(COMMANDS)
+
+
+def test_aeropend_runs_a_command_as_its_own_program_does(tmp_path):
+    folder = Path(sys.executable).parent
+    alone, through = (
+        subprocess.run([*command, "no_such_bag"], capture_output=True, text=True, check=False, cwd=tmp_path, timeout=60)
+        for command in ([folder / "step_response"], [folder / "aeropend", "step_response"]))
+    assert (through.returncode, through.stdout, through.stderr) == (2, "", alone.stderr)
+    assert alone.stderr.startswith("step_response: no_such_bag")
+
+
+@pytest.mark.parametrize(("typed", "hint"), [
+    ("diagnos", "did you mean diagnose?"),
+    ("xyz", "aeropend lists the commands"),
+])
+def test_aeropend_hints_at_a_mistyped_command(typed, hint, capsys):
+    assert aeropend.main([typed]) == 2
+    assert capsys.readouterr().err == f"aeropend: there is no command '{typed}'; {hint}\n"
+
+
+def test_aeropend_lists_the_commands_without_importing_them():
+    code = "from aeropend_sim.cli.aeropend import main; import sys; main([]); sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, check=False).returncode == 0
+
+
 def completions(line: str) -> list[str]:
     script = BASH.format(python=sys.executable)
     done = subprocess.run(["bash", "-c", script, "bash", line], capture_output=True, text=True, check=True, timeout=60)
@@ -99,6 +129,10 @@ def completions(line: str) -> list[str]:
     ("cascade --ros-args -p model:=CO", ["CONTRIBUTING.md"]),
     ("cascade --ros-args -p model:=t", ["thesis", "test/", "tools/"]),
     ("tune feedback_linearization --mo", ["--model"]),
+    ("aeropend diag", ["diagnose"]),
+    ("aeropend tune feedback_linearization --mo", ["--model"]),
+    ("aeropend plant --ros-args -p preset:=", ["bench", "thesis"]),
+    ("aeropend no_command --mo", []),
 ])
 def test_bash_completes_what_a_command_takes(line, expected):
     assert completions(str(Path(sys.executable).parent / line)) == expected
@@ -135,6 +169,8 @@ def zsh_completes(tmp_path_factory):
     ("plant --ros-args -p effects.coulomb_friction.a", "plant --ros-args -p effects.coulomb_friction.accel:="),
     ("cascade --ros-args -p model:=CO", "cascade --ros-args -p model:=CONTRIBUTING.md"),
     ("tune feedback_linearization --mo", "tune feedback_linearization --model"),
+    ("aeropend diag", "aeropend diagnose"),
+    ("aeropend tune feedback_linearization --mo", "aeropend tune feedback_linearization --model"),
 ])
 def test_zsh_completes_it_too(zsh_completes, line, completed):
     folder = f"{Path(sys.executable).parent}/"

@@ -25,5 +25,11 @@ setup(
     maintainer_email="maintainers@aeropend.example",
     description="The aeropendulum's model (dynamics, actuator, sensing, effects) and the simulated plant node.",
     license="Apache-2.0",
-    entry_points={"console_scripts": ["plant = aeropend_sim.nodes.plant:main", "pose = aeropend_sim.nodes.pose:main"]},
+    entry_points={
+        "console_scripts": [
+            "aeropend = aeropend_sim.cli.aeropend:main",
+            "plant = aeropend_sim.nodes.plant:main",
+            "pose = aeropend_sim.nodes.pose:main",
+        ]
+    },
 )

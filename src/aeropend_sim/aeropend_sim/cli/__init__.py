@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parts that all commands share: arguments, completion, progress."""
+"""The command `aeropend`, and the parts that all commands share: arguments, completion, progress."""

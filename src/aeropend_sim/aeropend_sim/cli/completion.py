@@ -3,6 +3,9 @@
 
 from importlib.metadata import EntryPoint, entry_points
 
+PROGRAM = "aeropend"
+"""The command that runs all others."""
+
 
 def commands() -> list[EntryPoint]:
     """All commands of the installed packages, by name."""
