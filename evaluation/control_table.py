@@ -24,7 +24,7 @@ from aeropend_control.analysis.step_response import step_responses
 from aeropend_control.laws.registry import LAWS
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, recorded
-from aeropend_sim.cli.command import EXIT_CODES, Parser, interruptible
+from aeropend_sim.cli.command import EXIT_CODES, Parser, entry_point
 from aeropend_sim.cli.progress import Show, nothing, progress
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
 from aeropend_sim.model.parameters import Model
@@ -121,7 +121,7 @@ def table(law_name: str, effects: list[str], diagnosed: bool, show: Show = nothi
     return out
 
 
-@interruptible
+@entry_point("control_table")
 def main() -> int:
     """The command; returns its exit code."""
     parser = Parser(prog="control_table", description=(__doc__ or "").partition("\n\n")[0], epilog=EXAMPLES,

@@ -185,8 +185,8 @@ def test_help_leaves_the_process_as_it_was(capsys):
 
 
 def test_a_command_whose_reader_is_gone_ends_in_silence():
-    code = ("from aeropend_sim.cli.command import interruptible as i; "
-            "exit(i(lambda: [print(k) for k in range(10**5)][0])())")
+    code = ("from aeropend_sim.cli.command import entry_point; "
+            "exit(entry_point('list')(lambda: [print(k) for k in range(10**5)][0])())")
     command = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert command.stdout.readline() == "0\n"
     command.stdout.close()

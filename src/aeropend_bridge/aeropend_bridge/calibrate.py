@@ -17,10 +17,10 @@ from datetime import date
 from pathlib import Path
 
 from aeropend_bridge import calibration, protocol
-from aeropend_bridge.calibration import Calibration
-from aeropend_bridge.link import Link, LinkError
+from aeropend_bridge.calibration import Calibration, CalibrationError
+from aeropend_bridge.link import Link
 from aeropend_bridge.protocol import Flag, Hello, Message, Mode, Sample, Scheme
-from aeropend_sim.cli.command import EXIT_CODES, Parser, interruptible
+from aeropend_sim.cli.command import EXIT_CODES, Parser, entry_point
 from aeropend_sim.cli.progress import Show, nothing, progress
 
 PATIENCE_S = 5.0
@@ -41,10 +41,6 @@ EXAMPLES = f"""examples, with the arm hanging still and no bridge running:
   bridge --ros-args --params-file my_rig.yaml      use the calibration
 
 {EXIT_CODES}"""
-
-
-class CalibrationError(Exception):
-    """A condition that the user can correct; one line."""
 
 
 def middle(counts: Sequence[int]) -> float:
@@ -203,7 +199,7 @@ def calibrate(port: str, seconds: float, base: Calibration, show: Show = nothing
         board.close()
 
 
-@interruptible
+@entry_point("calibrate")
 def main(args: Sequence[str] | None = None) -> int:
     """Entry point of `calibrate`."""
     parser = Parser(
@@ -220,22 +216,18 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument("--base", type=Path, metavar="FILE", help="calibration file that supplies the scales")
     parser.add_argument("--force", action="store_true", help="replace FILE if there is one")
     options = parser.parse_args(args)
-    try:
-        if not 0.1 <= options.seconds <= 600.0:
-            raise CalibrationError(f"--seconds is {options.seconds:g}: give 0.1 to 600")
-        if options.file.exists() and not options.force:
-            raise CalibrationError(f"there is a {options.file} already: give --force to replace it")
-        if not options.file.absolute().parent.is_dir():
-            raise CalibrationError(f"there is no folder {options.file.absolute().parent}: make it first")
-        base = calibration.load(options.base) if options.base else calibration.default()
-        with progress("reading the board at rest", 2.0 * options.seconds) as show:
-            found, notes = calibrate(str(options.port), options.seconds, base, show)
-        calibration.save(
-            found, options.file, f"Calibration measured at rest on {date.today().isoformat()}.\n" + "\n".join(notes)
-        )
-    except (CalibrationError, LinkError, ValueError) as error:
-        print(f"calibrate: {error}", file=sys.stderr)
-        return 2
+    if not 0.1 <= options.seconds <= 600.0:
+        raise CalibrationError(f"--seconds is {options.seconds:g}: give 0.1 to 600")
+    if options.file.exists() and not options.force:
+        raise CalibrationError(f"there is a {options.file} already: give --force to replace it")
+    if not options.file.absolute().parent.is_dir():
+        raise CalibrationError(f"there is no folder {options.file.absolute().parent}: make it first")
+    base = calibration.load(options.base) if options.base else calibration.default()
+    with progress("reading the board at rest", 2.0 * options.seconds) as show:
+        found, notes = calibrate(str(options.port), options.seconds, base, show)
+    calibration.save(
+        found, options.file, f"Calibration measured at rest on {date.today().isoformat()}.\n" + "\n".join(notes)
+    )
     for note in notes:
         print(f"note: {note}")
     for name in calibration.NAMES:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import yaml
 
 from aeropend_bridge.protocol import TICK_NS, Flag, Sample
+from aeropend_sim.errors import UserError
 from aeropend_sim.untrusted import load_yaml, printable
 
 DEFAULT = "motor_shield.yaml"
@@ -31,6 +32,10 @@ class Measured(NamedTuple):
     v_a: float
     i_a: float
     duty: float
+
+
+class CalibrationError(UserError):
+    """A calibration cannot be measured, read or written."""
 
 
 @dataclass(frozen=True)
@@ -127,29 +132,29 @@ def load(path: str | Path) -> Calibration:
         path: of the file.
 
     Raises:
-        ValueError: the file cannot be read, or a value in it cannot be used; one line.
+        CalibrationError: the file cannot be read, or a value in it cannot be used.
     """
     try:
         tree = load_yaml(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
-        raise ValueError(f"{path}: the calibration file cannot be read: {error.strerror}") from None
+        raise CalibrationError(f"{path}: the calibration file cannot be read: {error.strerror}") from None
     except (UnicodeDecodeError, yaml.YAMLError):
-        raise ValueError(f"{path}: not a parameter file; the presets show the form") from None
+        raise CalibrationError(f"{path}: not a parameter file; the presets show the form") from None
     try:
         (section,) = (part["ros__parameters"][SECTION] for part in tree.values())
         given = dict(section)
     except (AttributeError, KeyError, TypeError, ValueError):
-        raise ValueError(f"{path}: not a calibration; it reads '/**: ros__parameters: {SECTION}: ...'") from None
+        raise CalibrationError(f"{path}: not a calibration; it reads '/**: ros__parameters: {SECTION}: ...'") from None
     for name, value in given.items():
         if name not in NUMBERS:
-            raise ValueError(f"{path}: unknown number {name!r}; known: {', '.join(NUMBERS)}")
+            raise CalibrationError(f"{path}: unknown number {name!r}; known: {', '.join(NUMBERS)}")
         known = NUMBERS[name]
         try:  # 1e-5 is text in YAML 1.1
             given[name] = value = float(value)
         except (TypeError, ValueError, OverflowError):
-            raise ValueError(f"{path}: {name} is {value!r}; give a number") from None
+            raise CalibrationError(f"{path}: {name} is {value!r}; give a number") from None
         if not known.low <= value <= known.high:
-            raise ValueError(f"{path}: {name} = {value:g} is out of range; give {known.low:g} to {known.high:g}")
+            raise CalibrationError(f"{path}: {name} = {value:g} is out of range; give {known.low:g} to {known.high:g}")
     return Calibration(**{**vars(default()), **given})
 
 
@@ -162,7 +167,7 @@ def save(calibration: Calibration, path: str | Path, comment: str = "") -> None:
         comment: lines at the top of the file; each gets the prefix `# `.
 
     Raises:
-        ValueError: the file cannot be written. An old file is then unchanged.
+        CalibrationError: the file cannot be written. An old file is then unchanged.
     """
     lines = [f"# {printable(line)}" for line in comment.splitlines()]
     lines += ["/**:", "  ros__parameters:", f"    {SECTION}:"]
@@ -183,4 +188,4 @@ def save(calibration: Calibration, path: str | Path, comment: str = "") -> None:
     except OSError as error:
         if temporary is not None:
             Path(temporary).unlink(missing_ok=True)
-        raise ValueError(f"{path}: the calibration file cannot be written: {error.strerror}") from None
+        raise CalibrationError(f"{path}: the calibration file cannot be written: {error.strerror}") from None

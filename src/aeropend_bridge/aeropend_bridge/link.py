@@ -11,8 +11,10 @@ from contextlib import suppress
 
 import serial
 
+from aeropend_sim.errors import UserError
 
-class LinkError(Exception):
+
+class LinkError(UserError):
     """The port cannot be opened, or has disappeared. The message is one line with the reason and the remedy."""
 
 

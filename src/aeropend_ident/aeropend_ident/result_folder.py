@@ -11,15 +11,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from aeropend_sim.errors import UserError
 from aeropend_sim.model.parameters import ModelError
-from aeropend_sim.untrusted import one_line
 
 
-class OutputError(ValueError):
+class OutputError(UserError):
     """The results cannot be written; the message is one line for a person."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__(one_line(text))
 
 
 def check(out: Path, files: Sequence[str], *, overwrite: bool) -> None:

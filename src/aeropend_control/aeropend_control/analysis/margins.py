@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_control.laws.registry import LAWS
+from aeropend_sim.errors import UserError
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 from aeropend_sim.model.rig import Rig
 
@@ -68,7 +69,7 @@ class Margins(NamedTuple):
     loop: NDArray[np.complex128]
 
 
-class MarginError(ValueError):
+class MarginError(UserError):
     """The loop does not come to rest, so it has no margins; the message is one line for the user."""
 
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from aeropend_sim.errors import UserError
 from aeropend_sim.model.step_features import step_features
 
 Array = NDArray[np.float64]
@@ -21,7 +22,7 @@ RESOLVED = 4.0
 """Least height of a step or of an overshoot, in standard deviations of the noise of the response (choice)."""
 
 
-class StepError(ValueError):
+class StepError(UserError):
     """The recording has no step that can be described; the message is one line for the user."""
 
 

@@ -15,10 +15,10 @@ from rich.table import Table
 from aeropend_control.analysis import closed_loop
 from aeropend_control.analysis.margins import MarginError, Margins, margins
 from aeropend_control.analysis.step_response import StepError, StepResponse, step_responses
-from aeropend_control.laws.registry import LAWS, GainError, LawKind, Requirements, TuningError
-from aeropend_sim.cli.command import EXIT_CODES, Parser, interruptible
+from aeropend_control.laws.registry import LAWS, GainError, LawKind, Requirements
+from aeropend_sim.cli.command import EXIT_CODES, Parser, entry_point
 from aeropend_sim.cli.progress import Show, nothing, progress
-from aeropend_sim.model.parameters import Model, ModelError, load
+from aeropend_sim.model.parameters import Model, load
 
 LEVELS = {"theta": (0.2, 0.4, 0.7), "omega": (60.0, 99.5, 140.0)}
 """[rad], [rad/s] Steps from rest that are simulated, and operating points of the margins; 99.5 rad/s is the thesis'
@@ -126,17 +126,13 @@ def _number(value: float, digits: int) -> str:
     return f"{value:.{digits}f}" if math.isfinite(value) else "-" if math.isnan(value) else "any"
 
 
-@interruptible
+@entry_point("tune")
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
     options = parse(arguments)
     kind = LAWS[options.law]
-    try:
-        model = load(options.model)
-        gains = chosen_gains(kind, model, options)
-    except (ModelError, GainError, TuningError) as error:
-        print(f"tune: {error}", file=sys.stderr)
-        return 2
+    model = load(options.model)
+    gains = chosen_gains(kind, model, options)
     console = Console(width=130)
     console.print(f"{options.law} on {model.name}: {kind.summary}")
     console.print(gains_table(kind, gains))

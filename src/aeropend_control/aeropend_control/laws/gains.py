@@ -8,8 +8,10 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from aeropend_sim.errors import UserError
 
-class GainError(ValueError):
+
+class GainError(UserError):
     """A gain cannot be used; the message is one line for the user."""
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from aeropend_sim.errors import UserError
 from aeropend_sim.model import actuator
 from aeropend_sim.model.parameters import Model
 
@@ -22,7 +23,7 @@ TIME_SHARE, OVERSHOOT_SHARE = 0.7, 0.5
 """Shares of the required times and of the required overshoot that a tuned loop uses; the rest is reserve (choice)."""
 
 
-class TuningError(ValueError):
+class TuningError(UserError):
     """The model cannot meet the requirements; the message is one line for the user."""
 
 

@@ -26,11 +26,11 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Float64
 
-from aeropend_control.laws.registry import LAWS, GainError, Law, LawKind, TuningError
+from aeropend_control.laws.registry import LAWS, Law, LawKind
 from aeropend_control.nodes import wire
 from aeropend_control.nodes.supervisor import Supervisor
 from aeropend_sim.errors import UserError
-from aeropend_sim.model.parameters import PRESETS, ModelError, load
+from aeropend_sim.model.parameters import PRESETS, load
 from aeropend_sim.model.rig import Sample
 from aeropend_sim.ros import interface
 from aeropend_sim.ros.diagnostics import CpuShare, Diagnostics
@@ -159,15 +159,12 @@ class Controller(Node):
             raise UserError("give the parameters of a model as a file: -p model:=FILE")
         table = settings(self._kind)
         source, choice = (table[name].check(name, given.get(name, table[name].default)) for name in ("model", "gains"))
-        try:
-            model = load(source)
-            gains: dict[str, float] = dict(self._kind.presets.get(choice, {}))
-            gains |= {name: value for name, value in given.items() if name in self._kind.parameters}
-            if not gains.keys() >= self._kind.parameters.keys():
-                gains = {**self._kind.tune(model), **gains}
-            self._law = self._kind.make(model, gains)
-        except (ModelError, GainError, TuningError) as error:
-            raise UserError(str(error)) from error
+        model = load(source)
+        gains: dict[str, float] = dict(self._kind.presets.get(choice, {}))
+        gains |= {name: value for name, value in given.items() if name in self._kind.parameters}
+        if not gains.keys() >= self._kind.parameters.keys():
+            gains = {**self._kind.tune(model), **gains}
+        self._law = self._kind.make(model, gains)
         _warm_up(self._law, self._kind)
         self._table = table | {
             name: Setting(float(gains[name]), q.description, q.unit.removeprefix("-"), q.low, q.high, live=True)
@@ -185,7 +182,7 @@ class Controller(Node):
             new = {name: self._table[name].check(name, value) for name, value in named.items()}
             _check_order({"reference_min": supervisor.low, "reference_max": supervisor.high, **new})
             self._law.retune({name: value for name, value in new.items() if name in self._kind.parameters})
-        except (UserError, GainError) as error:
+        except UserError as error:
             self.get_logger().warn(f"parameters refused, the loop continues: {error}")
             return SetParametersResult(successful=False, reason=str(error))
         supervisor.low = new.get("reference_min", supervisor.low)

@@ -94,10 +94,7 @@ class Excite(Node):
         values: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()
         }
-        try:
-            self._excitation = Excitation(**values)
-        except ValueError as error:
-            raise UserError(str(error)) from error
+        self._excitation = Excitation(**values)
         self._series = self._excitation.series()
         self._publisher = self.create_publisher(Float64, interface.DUTY_COMMAND, interface.QOS)
         self._sent = 0

@@ -27,6 +27,7 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefiniti
 from rosbags.rosbag2 import Reader
 from rosbags.rosbag2.metadata import parse_qos
 
+from aeropend_sim.errors import UserError
 from aeropend_sim.untrusted import check_yaml, load_yaml, one_line
 
 if sys.version_info >= (3, 14):
@@ -59,11 +60,8 @@ _LATEST = (1 << 63) - 1  # ns
 _LONGEST_NAME = 255  # characters of a topic's name, as DDS has it
 
 
-class RecordingError(ValueError):
+class RecordingError(UserError):
     """A recording cannot be used; the message is one line for the user."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__(one_line(text))
 
 
 class Bag:

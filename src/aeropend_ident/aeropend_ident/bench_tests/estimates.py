@@ -19,6 +19,7 @@ from scipy.signal import lfilter
 from aeropend_ident.bags.recording import Recording, holds
 from aeropend_ident.identification.terms import Array
 from aeropend_ident.tables.units import RPM
+from aeropend_sim.errors import UserError
 from aeropend_sim.model import actuator
 from aeropend_sim.model.parameters import PARAMETERS
 
@@ -35,7 +36,7 @@ HOLD = 1.0
 """[s] Least length of a plateau of the duty; its last half is used. Choice."""
 
 
-class BenchTestError(ValueError):
+class BenchTestError(UserError):
     """A table or a recording that a bench test cannot use; the message is one line for the user."""
 
 

@@ -18,14 +18,14 @@ from pathlib import Path
 import numpy as np
 
 from aeropend_ident.bags import recording
-from aeropend_ident.bags.recording import Recording, RecordingError
+from aeropend_ident.bags.recording import Recording
 from aeropend_ident.bench_tests import estimates
 from aeropend_ident.bench_tests.estimates import BenchTestError, Estimate, Found, Rows
 from aeropend_ident.bench_tests.picture import scatter
 from aeropend_ident.bench_tests.table import read_rows
-from aeropend_ident.result_folder import OutputError, check, whole
-from aeropend_sim.cli.command import Parser, interruptible
-from aeropend_sim.model.parameters import PRESETS, Model, ModelError, from_flat, load, save
+from aeropend_ident.result_folder import check, whole
+from aeropend_sim.cli.command import Parser, entry_point
+from aeropend_sim.model.parameters import PRESETS, Model, from_flat, load, save
 
 FILES = ("bench.yaml", "bench_tests.json", "bench_tests.svg")
 
@@ -225,15 +225,10 @@ def run(options: argparse.Namespace) -> None:
     print("   ".join(str(out / name) for name in FILES))
 
 
-@interruptible
+@entry_point("bench_test")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
-    options = parse(arguments)
-    try:
-        run(options)
-    except (BenchTestError, RecordingError, ModelError, OutputError) as error:
-        print(f"bench_test: {error}", file=sys.stderr)
-        return 2
+    run(parse(arguments))
     return 0
 
 

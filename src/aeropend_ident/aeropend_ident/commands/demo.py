@@ -24,8 +24,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from aeropend_ident.diagnosis import document
-from aeropend_ident.diagnosis.document import DiagnosisDocument, DocumentError
-from aeropend_sim.cli.command import Parser
+from aeropend_ident.diagnosis.document import DiagnosisDocument
+from aeropend_sim.cli.command import Parser, entry_point
+from aeropend_sim.errors import UserError
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import Model, load, save
 
@@ -39,7 +40,7 @@ MODULES = {"plant": "aeropend_sim.nodes.plant", "excite": "aeropend_control.node
            "record": "aeropend_ident.nodes.record", "diagnose": "aeropend_ident.commands.diagnose"}
 
 
-class DemoError(RuntimeError):
+class DemoError(UserError):
     """The demo cannot go on; the message is one line for a person."""
 
 
@@ -149,6 +150,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return options
 
 
+@entry_point("demo", "interrupted; every process was stopped")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demo; returns the exit code."""
     options = _parse(arguments)
@@ -158,21 +160,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         folder.mkdir(parents=True)
     except OSError as error:
-        print(f"demo: {folder}: {error.strerror}; give a new folder with --out", file=sys.stderr)
-        return 2
-    try:
-        drawn, rig = draw(options.effect, options.seed)
-        save(rig, folder / "rig.yaml", "the rig of the demo: what diagnose is not told")
-        seed = options.seed if options.seed is not None else int(np.random.default_rng().integers(1000))
-        print(f"A rig whose flaw is hidden runs for {options.duration:g} s and is recorded; results go to {folder}")
-        bag = measure(folder, folder / "rig.yaml", options.duration, seed, console)
-        found = diagnose(folder, bag)
-    except (DemoError, DocumentError) as error:
-        print(f"demo: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("demo: interrupted; every process was stopped", file=sys.stderr)
-        return 130
+        raise DemoError(f"{folder}: {error.strerror}; give a new folder with --out") from None
+    drawn, rig = draw(options.effect, options.seed)
+    save(rig, folder / "rig.yaml", "the rig of the demo: what diagnose is not told")
+    seed = options.seed if options.seed is not None else int(np.random.default_rng().integers(1000))
+    print(f"A rig whose flaw is hidden runs for {options.duration:g} s and is recorded; results go to {folder}")
+    bag = measure(folder, folder / "rig.yaml", options.duration, seed, console)
+    found = diagnose(folder, bag)
     right = found.which.verdict == drawn
     truth = ", ".join(f"{k} = {v:.4g}" for p in rig.effects.values() for k, v in p.items())
     hidden = f"{drawn} ({truth})" if truth else drawn

@@ -26,11 +26,11 @@ from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.document import Across
 from aeropend_ident.diagnosis.results import FILES, Results, document
 from aeropend_ident.diagnosis.validation import validate
-from aeropend_ident.result_folder import OutputError, check
+from aeropend_ident.result_folder import check
 from aeropend_ident.signals.from_bag import signals_of
-from aeropend_sim.cli.command import Parser, between, own
+from aeropend_sim.cli.command import Parser, between, entry_point, own
 from aeropend_sim.cli.progress import progress
-from aeropend_sim.model.parameters import PRESETS, ModelError, load
+from aeropend_sim.model.parameters import PRESETS, load
 from aeropend_sim.untrusted import printable
 
 EXAMPLES = """examples:
@@ -119,11 +119,11 @@ def run(options: argparse.Namespace, command: str) -> None:
     print(printable(f"{out / 'report.html'}   {out / 'augmented.yaml'}   {results.document.seconds} s"))
 
 
-def run_each(options: argparse.Namespace) -> int:
-    """Diagnose recordings of a rig each, write what is found as it comes, and a table of it; returns the exit code.
+def run_each(options: argparse.Namespace) -> None:
+    """Diagnose recordings of a rig each, write what is found as it comes, and a table of it.
 
     Raises:
-        ModelError, OutputError, ClusterError: none can be diagnosed.
+        RecordingError, ModelError, OutputError, ClusterError: none can be diagnosed.
     """
     started = time.monotonic()
     out = Path(options.out or "diagnoses")
@@ -145,21 +145,18 @@ def run_each(options: argparse.Namespace) -> int:
                 show(len(rows), f"{len(rows)} of {len(names)} recordings")
     except KeyboardInterrupt:
         done = sum((out / name / "diagnosis.json").exists() for name in names)
-        raise Interrupted(f"interrupted; {done} of {len(names)} verdicts are in {out}" if done else
-                          "interrupted, nothing written") from None
+        if not done:
+            raise
+        raise KeyboardInterrupt(printable(f"interrupted; {done} of {len(names)} verdicts are in {out}")) from None
     batch.write_summary(out, rows)
     print_table(rows)
     refused = sum(bool(row["error"]) for row in rows)
     if refused == len(rows) == 1:
-        print(f"diagnose: {rows[0]['error']}", file=sys.stderr)
-        return 2
+        raise RecordingError(str(rows[0]["error"]))
     if refused == len(rows):
-        print(f"diagnose: none of the {refused} recordings can be used; {out / batch.SUMMARY} says why",
-              file=sys.stderr)
-        return 2
+        raise RecordingError(f"none of the {refused} recordings can be used; {out / batch.SUMMARY} says why")
     print(printable(f"{len(rows) - refused} of {len(rows)} diagnosed   {out / batch.SUMMARY}   "
                     f"{time.monotonic() - started:.1f} s"))
-    return 0
 
 
 def _alone(options: argparse.Namespace, bag: str, out: Path) -> str:
@@ -193,27 +190,15 @@ def _cell(text: object) -> str:
     return escape(printable(str(text)))
 
 
-class Interrupted(Exception):  # noqa: N818
-    """Ctrl-C; the message says what was done until then."""
-
-
+@entry_point("diagnose", "interrupted, nothing written")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
     arguments = own(arguments)
     options = parse(arguments)
-    try:
-        if options.each:
-            return run_each(options)
+    if options.each:
+        run_each(options)
+    else:
         run(options, shlex.join(["diagnose", *arguments]))
-    except (RecordingError, ModelError, OutputError, batch.ClusterError) as error:
-        print(f"diagnose: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("diagnose: interrupted, nothing written", file=sys.stderr)
-        return 130
-    except Interrupted as error:
-        print(f"diagnose: {error}", file=sys.stderr)
-        return 130
     return 0
 
 

@@ -26,10 +26,10 @@ from aeropend_ident.identification.output_error import Entries, Fitter
 from aeropend_ident.identification.output_error_selection import alternatives, linearise
 from aeropend_ident.identification.problem import Problem
 from aeropend_ident.identification.terms import Array, thesis_terms
-from aeropend_sim.cli.command import EXIT_CODES, Parser, interruptible
+from aeropend_sim.cli.command import EXIT_CODES, Parser, entry_point
 from aeropend_sim.cli.progress import Show, nothing, progress
 from aeropend_sim.model.excitation import KINDS, Excitation
-from aeropend_sim.model.parameters import PRESETS, SAMPLE_PERIOD, Model, ModelError, load
+from aeropend_sim.model.parameters import PRESETS, SAMPLE_PERIOD, Model, load
 from aeropend_sim.model.rig import record
 
 EXAMPLES = f"""examples:
@@ -123,7 +123,7 @@ def quality(model: Model, data: Dataset, show: Show = nothing) -> list[Excited]:
     return found
 
 
-@interruptible
+@entry_point("excitation_quality")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
     parser = Parser(prog="excitation_quality", epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -142,19 +142,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=plan.seed,
                         help="seed of the signal and of the noise; default %(default)s")
     options = parser.parse_args(arguments)
-    try:
-        model = load(options.model)
-        with progress("reading") as show:
-            if options.bag:
-                data = dataset.from_bag(recording.read(options.bag, options.namespace), model.sensing, held_out=0.0)
-            else:
-                signal = Excitation(options.kind, options.duration, options.seed, options.duty_min, options.duty_max,
-                                    options.hold_min, options.hold_max, rest=options.rest)
-                data = planned(model, signal.series())
-            found = quality(model, data, show)
-    except (RecordingError, ModelError, ValueError) as error:
-        print(f"excitation_quality: {error}", file=sys.stderr)
-        return 2
+    model = load(options.model)
+    with progress("reading") as show:
+        if options.bag:
+            data = dataset.from_bag(recording.read(options.bag, options.namespace), model.sensing, held_out=0.0)
+        else:
+            signal = Excitation(options.kind, options.duration, options.seed, options.duty_min, options.duty_max,
+                                options.hold_min, options.hold_max, rest=options.rest)
+            data = planned(model, signal.series())
+        found = quality(model, data, show)
     for one in found:
         remark = "poorly excited" if one.poor else ""
         if one.rivals:

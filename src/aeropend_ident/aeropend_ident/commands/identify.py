@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from aeropend_ident.bags import recording
-from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.diagnosis.batch import names
 from aeropend_ident.identification import dataset, picture
 from aeropend_ident.identification.dataset import Dataset
@@ -22,11 +21,10 @@ from aeropend_ident.identification.discrepancy import nominal
 from aeropend_ident.identification.identify import METHODS, Identified, identify_with_traces
 from aeropend_ident.identification.output_error_selection import STABLE
 from aeropend_ident.identification.sindy import DERIVATIVES
-from aeropend_ident.identification.terms import TermError
-from aeropend_ident.result_folder import OutputError, check, whole
-from aeropend_sim.cli.command import Parser, between, interruptible
+from aeropend_ident.result_folder import check, whole
+from aeropend_sim.cli.command import Parser, between, entry_point
 from aeropend_sim.cli.progress import progress
-from aeropend_sim.model.parameters import PRESETS, ModelError, load
+from aeropend_sim.model.parameters import PRESETS, load
 
 FORMAT = 1
 FILES = ("identified.json", "identified.svg")
@@ -151,15 +149,10 @@ def _listed(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-@interruptible
+@entry_point("identify")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
-    options = parse(arguments)
-    try:
-        run(options)
-    except (RecordingError, ModelError, OutputError, TermError) as error:
-        print(f"identify: {error}", file=sys.stderr)
-        return 2
+    run(parse(arguments))
     return 0
 
 

@@ -28,7 +28,7 @@ from aeropend_ident.tables.mapping import Plan, Samples, no_time, samples
 from aeropend_ident.tables.table import Table, TableError, many
 from aeropend_ident.tables.units import UNITS, listed
 from aeropend_ident.tables.write import BagExistsError, write
-from aeropend_sim.cli.command import EXIT_CODES, Parser, between, interruptible, own
+from aeropend_sim.cli.command import EXIT_CODES, Parser, between, entry_point, own
 from aeropend_sim.cli.progress import progress
 from aeropend_sim.untrusted import one_line, printable
 
@@ -262,16 +262,12 @@ def propose(table: Table, found: Sequence[Guess], chosen: dict[str, str], given:
     return 2
 
 
-@interruptible
+@entry_point("import")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
     arguments = own(arguments)
     given = parse(arguments)
-    try:
-        return run(given, arguments)
-    except (TableError, BagExistsError) as error:
-        print(f"import: {one_line(str(error))}", file=sys.stderr)
-        return 2
+    return run(given, arguments)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from rosbags.typesys.store import Typestore
 from aeropend_ident.bags.bag import Bag, RecordingError
 from aeropend_ident.bags.msgtypes import learn
 from aeropend_ident.bags.writer import BagWriter
-from aeropend_sim.cli.command import EXIT_CODES, Parser
+from aeropend_sim.cli.command import EXIT_CODES, Parser, entry_point
 from aeropend_sim.cli.progress import Show, nothing, progress
 
 CHECKPOINT_MESSAGES = 20_000
@@ -163,6 +163,7 @@ def _discard(writer: BagWriter) -> None:
         shutil.rmtree(writer.path, ignore_errors=True)
 
 
+@entry_point("recover", "interrupted, nothing was written")
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command."""
     parser = Parser(
@@ -174,15 +175,8 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument("bag", metavar="BAG", help="rosbag2 folder, or a bare .mcap or .db3 file")
     parser.add_argument("--out", metavar="DIR", help="folder to make (default: BAG_recovered)")
     options = parser.parse_args(args)
-    try:
-        with progress("recovering") as show:
-            done = recover(options.bag, options.out, show)
-    except RecordingError as error:
-        print(f"recover: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("recover: interrupted, nothing was written", file=sys.stderr)
-        return 130
+    with progress("recovering") as show:
+        done = recover(options.bag, options.out, show)
     total = sum(done.counts.values())
     if done.out is None:
         print(f"{options.bag} is whole: {total} messages over {done.seconds:.3f} s, nothing to recover")

@@ -17,8 +17,9 @@ from rich.console import Console
 from aeropend_control.analysis import step_report
 from aeropend_control.analysis.step_response import StepError, step_responses
 from aeropend_control.laws.registry import LAWS
-from aeropend_ident.bags.recording import Recording, RecordingError, read
-from aeropend_sim.cli.command import EXIT_CODES, Parser, interruptible, own
+from aeropend_ident.bags.recording import Recording, read
+from aeropend_ident.result_folder import OutputError
+from aeropend_sim.cli.command import EXIT_CODES, Parser, entry_point
 
 SHORTEST_S = 1.0
 """A last step held for less is left out: recordings end at any time."""
@@ -31,7 +32,7 @@ examples:
 {EXIT_CODES}"""
 
 
-def parse(arguments: Sequence[str]) -> argparse.Namespace:
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Read the command line; exits with 2 and one line where it is wrong."""
     parser = Parser(
         prog="step_response", epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -87,7 +88,7 @@ def run(options: argparse.Namespace) -> None:
 
     Raises:
         RecordingError, StepError: the recording cannot be used.
-        OSError: the drawing cannot be written.
+        OutputError: the drawing cannot be written.
     """
     kind = LAWS[options.law]
     recording = read(options.bag, options.namespace)
@@ -98,24 +99,20 @@ def run(options: argparse.Namespace) -> None:
     except StepError as error:
         raise StepError(f"{recording.path}: {error}") from None
     if options.plot is not None:
-        options.plot.write_text(step_report.draw(time, grid["reference"], y, grid["duty"], recording.path,
-                                           f"{kind.measures} / {kind.reference_unit}"), encoding="utf-8")
+        drawing = step_report.draw(time, grid["reference"], y, grid["duty"], recording.path,
+                                   f"{kind.measures} / {kind.reference_unit}")
+        try:
+            options.plot.write_text(drawing, encoding="utf-8")
+        except OSError as error:
+            raise OutputError(f"{options.plot} cannot be written: {error.strerror}") from None
     console = Console(width=None if sys.stdout.isatty() else 120)
     console.print(step_report.table({options.law: described}, {options.law: kind.reference_unit}))
 
 
-@interruptible
+@entry_point("step_response")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
-    options = parse(own(arguments))
-    try:
-        run(options)
-    except (RecordingError, StepError) as error:
-        print(f"step_response: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"step_response: {options.plot} cannot be written: {error.strerror}", file=sys.stderr)
-        return 2
+    run(parse(arguments))
     return 0
 
 

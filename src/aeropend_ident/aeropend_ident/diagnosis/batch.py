@@ -28,6 +28,7 @@ from aeropend_ident.diagnosis.results import Results, document
 from aeropend_ident.result_folder import OutputError, on_interrupt
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import Signals
+from aeropend_sim.errors import UserError
 from aeropend_sim.model.parameters import Model
 from aeropend_sim.untrusted import one_line, printable
 
@@ -42,7 +43,7 @@ ANSWER_WITHIN = 5.0
 KILLED = "the process at work on it was killed, most likely for want of memory"
 
 
-class ClusterError(ValueError):
+class ClusterError(UserError):
     """The Dask cluster cannot be used; the message is one line for a person."""
 
 

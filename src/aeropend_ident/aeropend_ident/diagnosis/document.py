@@ -17,7 +17,6 @@ from pathlib import Path
 from aeropend_ident.diagnosis import typed_json
 from aeropend_ident.diagnosis.typed_json import JsonError
 from aeropend_sim.errors import UserError
-from aeropend_sim.untrusted import one_line
 
 FORMAT = 1
 """Number of the format that this version writes and reads."""
@@ -429,7 +428,7 @@ def from_json(data: object) -> DiagnosisDocument:
     try:
         return typed_json.from_json(DiagnosisDocument, data)
     except JsonError as error:
-        raise DocumentError(one_line(f"no valid diagnosis document: {error}; diagnose the recording again")) from None
+        raise DocumentError(f"no valid diagnosis document: {error}; diagnose the recording again") from None
 
 
 def read(path: Path) -> DiagnosisDocument:
@@ -439,13 +438,15 @@ def read(path: Path) -> DiagnosisDocument:
         DocumentError: it cannot be read, or is no document.
     """
     try:
-        return from_json(json.loads(path.read_text(encoding="utf-8")))
+        data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise DocumentError(one_line(f"{path}: cannot be read: {error.strerror}; name a diagnosis.json")) from None
+        raise DocumentError(f"{path}: cannot be read: {error.strerror}; name a diagnosis.json") from None
     except (ValueError, RecursionError):
-        raise DocumentError(one_line(f"{path}: is no JSON; give a diagnosis.json of 'diagnose'")) from None
+        raise DocumentError(f"{path}: is no JSON; give a diagnosis.json of 'diagnose'") from None
+    try:
+        return from_json(data)
     except DocumentError as error:
-        raise DocumentError(one_line(f"{path}: {error}")) from None
+        raise DocumentError(f"{path}: {error}") from None
 
 
 def schema() -> dict[str, object]:

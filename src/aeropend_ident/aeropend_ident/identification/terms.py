@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_sim.compiled import njit
+from aeropend_sim.errors import UserError
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -25,7 +26,7 @@ _FUNCTIONS = {"sin": SIN, "cos": COS, "abs": ABS, "sign": SIGN}
 _FACTOR = re.compile(r"(?:(?P<call>[a-z]+)\((?P<inner>\w+)\)|(?P<name>[A-Za-z_]\w*))(?:\^(?P<power>[0-9.]+))?$")
 
 
-class TermError(ValueError):
+class TermError(UserError):
     """A term cannot be read; the message is one line for a person."""
 
 

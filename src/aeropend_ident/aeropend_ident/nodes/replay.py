@@ -198,10 +198,7 @@ class Replay(Node):
         self._wait: float = settings["wait"]
         self._stop_duty: bool = settings["stop_duty"]
         topics = [topic.strip() for topic in settings["topics"].split(",") if topic.strip()]
-        try:
-            self._plan = Plan(path, topics, settings["namespace"], settings["start"])
-        except RecordingError as error:
-            raise UserError(str(error)) from error
+        self._plan = Plan(path, topics, settings["namespace"], settings["start"])
         for problem in self._plan.bag.problems:
             self.get_logger().warn(problem)
         self._outlets: dict[tuple[str, str], Publisher] = {}

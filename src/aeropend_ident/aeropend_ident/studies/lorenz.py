@@ -17,7 +17,7 @@ from aeropend_ident.identification.dataset import Dataset, from_arrays
 from aeropend_ident.identification.identify import METHODS, Identified, identify
 from aeropend_ident.identification.output_error import Entries, Experiment, Fitter
 from aeropend_ident.identification.terms import Array, Library, polynomials
-from aeropend_sim.cli.command import EXIT_CODES, Parser, interruptible
+from aeropend_sim.cli.command import EXIT_CODES, Parser, entry_point
 from aeropend_sim.cli.progress import progress
 
 STATES = ("x", "y", "z")
@@ -101,7 +101,7 @@ def is_exact(found: Mapping[str, Mapping[str, float]], true: Mapping[str, Mappin
     return all(set(found[s]) == set(true[s]) for s in true)
 
 
-@interruptible
+@entry_point("lorenz")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the equations found by each method; returns the exit code."""
     parser = Parser(prog="lorenz", description="Identify the Lorenz system by each method.",

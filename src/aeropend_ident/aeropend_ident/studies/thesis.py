@@ -28,7 +28,7 @@ from aeropend_ident.identification.identify import Identified, identify
 from aeropend_ident.identification.terms import Array, Library, thesis_terms
 from aeropend_ident.signals.derivatives import tv_derivative
 from aeropend_ident.tables.units import RPM
-from aeropend_sim.cli.command import Parser, interruptible
+from aeropend_sim.cli.command import Parser, entry_point
 from aeropend_sim.model import actuator, dynamics, rig
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
@@ -313,7 +313,7 @@ def _mse(matrix: Array, figure: str, seed: int) -> float:
     return float(np.mean((rate - rates(seed)[late, 1]) ** 2))
 
 
-@interruptible
+@entry_point("thesis")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the tables; returns the exit code."""
     parser = Parser(prog="thesis", formatter_class=argparse.RawDescriptionHelpFormatter, epilog="""examples:

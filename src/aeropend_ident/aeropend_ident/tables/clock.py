@@ -27,6 +27,7 @@ from scipy.signal import savgol_filter
 from scipy.stats import theilslopes
 
 from aeropend_ident.tables.table import Floats, Ints, many
+from aeropend_sim.errors import UserError
 
 CLOCKS = ("auto", "even", "stamps")
 
@@ -100,7 +101,7 @@ REPEATED = 0.05
 """Greatest share of rows that are sorted, or left out because they have the stamp of the row before (choice)."""
 
 
-class ClockError(ValueError):
+class ClockError(UserError):
     """The times of the rows cannot be determined; the message is part of a line for the user."""
 
 

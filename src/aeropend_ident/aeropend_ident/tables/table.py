@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from aeropend_sim.errors import UserError
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
@@ -25,7 +27,7 @@ SHOWN = 3
 """Number of cells of a column that are kept as text, to show them."""
 
 
-class TableError(ValueError):
+class TableError(UserError):
     """A table cannot be used; the message is one line for the user."""
 
 

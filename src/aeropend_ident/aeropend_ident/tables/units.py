@@ -7,6 +7,8 @@ import math
 import re
 from dataclasses import dataclass
 
+from aeropend_sim.errors import UserError
+
 DEGREE = math.pi / 180.0
 TURN = 2.0 * math.pi
 RPM = TURN / 60.0
@@ -59,7 +61,7 @@ _SLASH = re.compile(r"^(.*?\S)\s*(?:/| in )\s*(\S+)$")
 _TAIL = re.compile(r"^(.*[^_\s])_(deg|rad|rpm|ms|us|sec|s|mA|A|mV|V|pct|percent|rad_s|counts)$")
 
 
-class UnitError(ValueError):
+class UnitError(UserError):
     """A unit is unknown; the message is part of a line for the user."""
 
 

@@ -20,6 +20,7 @@ from aeropend_ident.bags.cdr import encode
 from aeropend_ident.bags.writer import BagWriter
 from aeropend_ident.tables.mapping import Samples
 from aeropend_ident.tables.table import Floats, Ints
+from aeropend_sim.errors import UserError
 
 JOINT, BATTERY, FLOAT = "sensor_msgs/msg/JointState", "sensor_msgs/msg/BatteryState", "std_msgs/msg/Float64"
 
@@ -27,7 +28,7 @@ BLOCK = 5000
 """Number of samples that are serialized at once (choice)."""
 
 
-class BagExistsError(ValueError):
+class BagExistsError(UserError):
     """The recording exists already."""
 
 

@@ -14,6 +14,7 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, NoReturn, ParamSpec
 
+from aeropend_sim.errors import UserError
 from aeropend_sim.model.parameters import PRESETS
 
 EXIT_CODES = "exit codes: 0 done, 2 the input cannot be used (one line says why), 130 interrupted"
@@ -97,23 +98,37 @@ def between(low: float, high: float, what: str, unit: str = "") -> Callable[[str
 P = ParamSpec("P")
 
 
-def interruptible(main: Callable[P, int]) -> Callable[P, int]:
-    """Make an entry point end with one line and code 130 on Ctrl-C, and silently if its output is closed."""
+def entry_point(name: str, interrupted: str = "interrupted") -> Callable[[Callable[P, int]], Callable[P, int]]:
+    """A decorator that makes a function the entry point of a command.
 
-    @wraps(main)
-    def interruptible_main(*args: P.args, **kwargs: P.kwargs) -> int:
-        try:
-            code = main(*args, **kwargs)
-            sys.stdout.flush()
-            return code
-        except KeyboardInterrupt:
-            print(f"{Path(sys.argv[0]).stem}: interrupted", file=sys.stderr)
-            return 130
-        except BrokenPipeError:  # as in `identify my_bag | head -1`
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the rest of the output goes there
-            return 128 + signal.SIGPIPE
+    A `UserError` ends the command with one line and exit code 2, Ctrl-C with one line and code 130, a closed output
+    silently.
 
-    return interruptible_main
+    Args:
+        name: of the command.
+        interrupted: line after Ctrl-C, if the KeyboardInterrupt has no text of its own.
+    """
+
+    def decorate(main: Callable[P, int]) -> Callable[P, int]:
+        @wraps(main)
+        def run(*args: P.args, **kwargs: P.kwargs) -> int:
+            try:
+                code = main(*args, **kwargs)
+                sys.stdout.flush()
+                return code
+            except UserError as error:
+                print(f"{name}: {error}", file=sys.stderr)
+                return 2
+            except KeyboardInterrupt as stop:
+                print(f"{name}: {stop}" if str(stop) else f"{name}: {interrupted}", file=sys.stderr)
+                return 130
+            except BrokenPipeError:  # as in `identify my_bag | head -1`
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the rest of the output goes there
+                return 128 + signal.SIGPIPE
+
+        return run
+
+    return decorate
 
 
 def files(prefix: str, **_: Any) -> Iterable[str]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from aeropend_sim.errors import UserError
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
 Array = NDArray[np.float64]
@@ -32,7 +33,7 @@ class Excitation:
         frequencies: [Hz] frequencies of multisine.
 
     Raises:
-        ValueError: the fields contradict each other; one line.
+        UserError: the fields contradict each other.
     """
 
     kind: str = "latin_hypercube"
@@ -74,7 +75,7 @@ class Excitation:
             ),
         ):
             if wrong:
-                raise ValueError(message)
+                raise UserError(message)
 
     def series(self) -> Array:
         """The duty (N,) at each sample, 0..1, held for one `SAMPLE_PERIOD`."""

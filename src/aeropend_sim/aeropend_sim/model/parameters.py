@@ -14,8 +14,9 @@ from pathlib import Path
 
 import yaml
 
+from aeropend_sim.errors import UserError
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
-from aeropend_sim.untrusted import load_yaml, one_line, printable
+from aeropend_sim.untrusted import load_yaml, printable
 
 SAMPLE_PERIOD = 64 * 510 / 16e6
 """[s] Sample period: Timer1 of a 16 MHz ATmega2560, 8-bit phase-correct PWM, prescaler 64 (thesis 4.3.2)."""
@@ -26,11 +27,8 @@ SECTIONS = ("model", "sensing", "effects")
 """The sections of a model file. The parameters of a node may stand beside them."""
 
 
-class ModelError(ValueError):
+class ModelError(UserError):
     """A model file, preset or value that cannot be used. The message is one line."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__(one_line(text))
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,6 @@ from aeropend_sim.model.parameters import (
     PRESETS,
     SAMPLE_PERIOD,
     Model,
-    ModelError,
     from_flat,
     load,
     to_flat,
@@ -281,10 +280,7 @@ def read_parameters(node: Node, given: dict[str, Any]) -> tuple[dict[str, Any], 
     mine = {name: value for name, value in given.items() if name.split(".")[0] not in ("model", "sensing", "effects")}
     settings = read_settings(node, SETTINGS, mine)
     flat = {name: value for name, value in given.items() if name not in mine}
-    try:
-        model = from_flat(_with_defaults(flat), "parameters", load(settings["preset"]))
-    except ModelError as error:
-        raise UserError(str(error)) from error
+    model = from_flat(_with_defaults(flat), "parameters", load(settings["preset"]))
     for name, value in to_flat(model).items():
         declare(node, name, value, _setting(name).descriptor())
     return settings, model

@@ -39,7 +39,6 @@ from aeropend_sim.errors import UserError
 from aeropend_sim.ros.parameter_files import readable_parameter_files
 from aeropend_sim.ros.transport import without_shared_memory
 from aeropend_sim.ros.usage import Usage, no_words
-from aeropend_sim.untrusted import one_line
 
 RCLError = rclpy_implementation.RCLError
 
@@ -119,7 +118,7 @@ def run(
                 raise UserError(" ".join(names.get(word.strip("'."), word) for word in str(error).split())) from error
         code = _spin(make_node if words is None else partial(make_node, words), stop)
     except UserError as error:
-        print(one_line(f"{program}: {' '.join(str(error).split())}"), file=sys.stderr)
+        print(f"{program}: {error}", file=sys.stderr)
     finally:
         stop.ignore()
         with _leaving(code):
@@ -150,7 +149,7 @@ def _init(argv: list[str]) -> None:
 
 def _short(error: Exception) -> str:
     """The message of rcl without C source lines and parser internals."""
-    text = str(error).split(", at /")[0].split(". Error: Expected lexeme")[0]
+    text = " ".join(str(error).split()).split(", at /")[0].split(". Error: Expected lexeme")[0]
     for prefix in ("failed to initialize rcl: ", "Failed to parse ROS arguments: "):
         text = text.removeprefix(prefix)
     return f"unknown ROS argument {text}" if type(error).__name__ == "UnknownROSArgsError" else text

@@ -25,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from aeropend_sim.cli.command import EXIT_CODES, Parser, interruptible
+from aeropend_sim.cli.command import EXIT_CODES, Parser, entry_point
+from aeropend_sim.errors import UserError
 from aeropend_sim.model import actuator
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
 from aeropend_sim.model.rig import record
@@ -196,7 +197,7 @@ def _first_rise(time: Array, y: Array) -> tuple[Array, Array]:
     return np.maximum.accumulate(y[:top]), time[:top]
 
 
-@interruptible
+@entry_point("bench_fit")
 def main(arguments: list[str] | None = None) -> int:
     """Fit, print the table and save the picture; the exit code."""
     parser = Parser(prog="bench_fit", description="Fits the preset bench to the measured step.",
@@ -204,20 +205,18 @@ def main(arguments: list[str] | None = None) -> int:
                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plot", type=Path, metavar="FILE", help="save a picture of the step (needs matplotlib)")
     path: Path | None = parser.parse_args(arguments).plot
+    if path is not None and path.exists():
+        raise UserError(f"{path}: it exists; name another or remove it")
+    base = load("bench")
+    fitted = fit(base)
+    print(table(base, fitted))
     try:
-        if path is not None and path.exists():
-            raise FileExistsError(17, "it exists; name another or remove it")
-        base = load("bench")
-        fitted = fit(base)
-        print(table(base, fitted))
         if path is not None:
             plot(base, fitted, path)
     except ImportError:
-        print("bench_fit: --plot needs matplotlib: pip install matplotlib", file=sys.stderr)
-        return 2
-    except (OSError, ValueError) as error:
-        print(f"bench_fit: {path}: {getattr(error, 'strerror', None) or error}", file=sys.stderr)
-        return 2
+        raise UserError("--plot needs matplotlib: pip install matplotlib") from None
+    except (OSError, ValueError) as error:  # ValueError: matplotlib does not know this kind of file
+        raise UserError(f"{path}: {getattr(error, 'strerror', None) or error}") from None
     return 0
 
 
