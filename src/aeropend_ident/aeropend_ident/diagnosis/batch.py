@@ -37,7 +37,7 @@ COLUMNS = ("recording", "folder", "verdict", "place", "effects", "gap", "gap_aft
            "closed_high", "seconds", "error")
 
 ANSWER_WITHIN = 5.0
-"""s within which a Dask scheduler and a first worker must answer."""
+"""[s] Time within which a Dask scheduler and a first worker must answer (choice)."""
 
 
 KILLED = "the process at work on it was killed, most likely for want of memory"

@@ -35,7 +35,7 @@ DETERMINED = 0.5
 """Share of a prior's width above which the recordings have not determined a parameter (choice)."""
 
 TRACE = 1e-3
-"""Probability below which the gap of a candidate is not computed: it would change nothing."""
+"""Probability below which the gap of a candidate is not computed (choice: such a candidate is no rival)."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from aeropend_ident.diagnosis.typed_json import JsonError
 from aeropend_sim.errors import UserError
 
 FORMAT = 1
-"""Number of the format that this version writes and reads."""
+"""Number of the format that this version writes and reads (format)."""
 
 
 class DocumentError(UserError):

@@ -56,13 +56,17 @@ REFITS = 10
 """Steps of a refit (choice: it stops earlier when it gains little)."""
 
 STEP = 0.01
-"""Standard deviations of its prior by which a parameter is varied for a derivative."""
+"""Standard deviations of its prior by which a parameter is varied for a derivative (choice)."""
 
 REJECTED = 30.0
-"""Factor on the damping after a step that fails: the slopes are approximate, so a far shorter one is tried."""
+"""Factor on the damping after a step that fails.
+
+Choice: the slopes are approximate, so a far shorter step is tried."""
 
 ENOUGH, ENOUGH_OF_COST = 0.1, 0.05
-"""Decrease of the squared distance below which a refit stops: absolute, and relative. The result is rounded to 1."""
+"""Decrease of the squared distance below which a refit stops: absolute, and relative.
+
+Choice: the result is rounded to 1."""
 
 Distance = tuple[float, str]
 """Standard deviations by which two hypotheses differ, and the channel that shows most of it."""

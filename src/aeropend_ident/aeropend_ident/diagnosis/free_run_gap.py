@@ -20,10 +20,12 @@ from aeropend_sim.model.parameters import Model
 Array = NDArray[np.float64]
 
 WINDOW = 2.0
-"""[s] Block of the bootstrap: several time constants of the arm, so that blocks are nearly independent."""
+"""[s] Block of the bootstrap.
+
+Choice: several time constants of the arm, so that blocks are nearly independent."""
 
 RESAMPLES = 2000
-"""Resamples of the bootstrap: the ends of a 95 % interval then vary by about 2 % of its width."""
+"""Resamples of the bootstrap (choice: the ends of a 95 % interval then vary by about 2 % of its width)."""
 
 AT_REST = 0.05
 """Share of its spread over the whole recording below which a channel rests on held-out data (choice)."""

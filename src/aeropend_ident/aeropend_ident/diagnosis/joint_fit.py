@@ -25,15 +25,17 @@ from aeropend_sim.model.parameters import Model
 Array = NDArray[np.float64]
 
 Z95 = 1.959964
-"""Standard deviations of a normal distribution on either side of its mean that hold 95 %."""
+"""Standard deviations of a normal distribution on either side of its mean that hold 95 % (derived)."""
 
 CERTAIN = 15.0
-"""Log evidence above which an effect of an uncalibrated rig is claimed however uncertain its size is: odds of 3·10⁶."""
+"""Log evidence above which an effect of an uncalibrated rig is claimed however uncertain its size is.
+
+Choice: odds of 3·10⁶."""
 
 SURE = 2.5
 """Standard deviations by which an effect must differ from none, and a parameter from nominal, after the joint fit.
 
-98.8 % each: some effects are tested in each recording."""
+Choice: 98.8 % each, since some effects are tested in each recording."""
 
 WIDER = 1.2
 """Factor on the standard deviations of a fit, since its inputs are measured too and quantisation is not white.

@@ -34,8 +34,8 @@ class UnknownLimits:
 
     Attributes:
         form: share of the misfit that an effect may leave because the true one has another form.
-        form_elsewhere: the same if a missing term at another place explains more.
-        form_of_several: the same if one missing term explains more than effects at several places.
+        form_elsewhere: share as `form`, if a missing term at another place explains more.
+        form_of_several: share as `form`, if one missing term explains more than effects at several places.
         kept: share of a channel's own misfit that may stay.
         noticeable: mean square residual, in units of a reading's noise, above which a misfit counts.
     """
@@ -55,13 +55,13 @@ class Policy:
         name: of the kind.
         calibrated: the model's parameters are within 5 %, and its measurement chain is known.
         driven: a duty acts at some time. A calibrated rig counts as driven.
-        screening_rounds: rounds of the fits after the screening.
-        steps: Levenberg-Marquardt steps in a round.
-        least_ess: effective sample size that the angle counts for at least during a search.
-        budget: simulations after which no further effect is searched; None: unlimited.
+        screening_rounds: rounds of the fits after the screening (choice).
+        steps: Levenberg-Marquardt steps in a round (choice).
+        least_ess: effective sample size that the angle counts for at least during a search (choice).
+        budget: simulations after which no further effect is searched (choice); None: unlimited.
         noise_margin: as `MATERIAL`, for a residual that follows neither inputs nor states: the noise may be
-            underestimated by as much.
-        undecided: probability above which a rival is not ruled out.
+            underestimated by as much (choice).
+        undecided: probability above which a rival is not ruled out (choice).
         unknown: when the rest counts as an unknown effect.
     """
 
@@ -85,17 +85,19 @@ class Policy:
 CALIBRATED = Policy(
     "calibrated rig", calibrated=True, driven=True, screening_rounds=2, steps=4, least_ess=0.0, budget=None,
     noise_margin=MATERIAL, undecided=0.05, unknown=UnknownLimits(0.12, 0.025, 0.01, 0.25, NOTICEABLE))
-"""Limits for an unknown effect: measured on simulated rigs whose effects have another form than the catalogue's."""
+"""Limits for an unknown effect (measured: simulated rigs whose effects have another form than the catalogue's)."""
 
 UNCALIBRATED = Policy(
     "uncalibrated rig", calibrated=False, driven=True, screening_rounds=1, steps=12, least_ess=100.0, budget=3500,
     noise_margin=0.75, undecided=0.01, unknown=UnknownLimits(0.2, 0.08, 0.08, 0.25, GOOD_ENOUGH**2))
-"""Wider limits: parameters in long valleys need more steps; the noise is estimated, and may be a seventh too small."""
+"""Wider limits (choice): parameters in long valleys need more steps.
+
+The noise is estimated, and may be a seventh too small."""
 
 FREE_DECAY = Policy(
     "free decay", calibrated=False, driven=False, screening_rounds=2, steps=4, least_ess=0.0, budget=None,
     noise_margin=0.75, undecided=0.01, unknown=UnknownLimits(0.6, 0.6, 0.6, 0.6, GOOD_ENOUGH**2))
-"""Widest limits: the noise holds unsteady stamps too, and few swings show little of an effect's form."""
+"""Widest limits (choice): the noise holds unsteady stamps too, and few swings show little of an effect's form."""
 
 
 def free_swinging(recordings: Sequence[Signals]) -> bool:

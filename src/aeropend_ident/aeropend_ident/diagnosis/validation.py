@@ -18,7 +18,7 @@ from aeropend_sim.model.parameters import Model
 Array = NDArray[np.float64]
 
 FORGOTTEN = 5.0
-"""[s] Time after which the arm has forgotten its initial state: some of its time constants."""
+"""[s] Time after which the arm has forgotten its initial state (choice: some of its time constants)."""
 
 
 def validate(model: Model, augmented: Model, signals: Signals) -> ClosedGap:

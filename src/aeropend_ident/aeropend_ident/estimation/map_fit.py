@@ -44,7 +44,9 @@ WEIGHT_CHANGE = 0.02
 """Relative change of a channel's weight that counts as a change (choice)."""
 
 STEP = 1e-4
-"""Step of the finite differences, in standard deviations of the prior: well above rounding, well below curvature."""
+"""Step of the finite differences, in standard deviations of the prior.
+
+Choice: well above rounding, well below curvature."""
 
 DAMPING, DAMPING_DOWN, DAMPING_UP, MOST_DAMPING = 1e-3, 0.2, 8.0, 1e6
 """Levenberg-Marquardt damping: first value, factors after a step that succeeds and one that fails, and where it ends.
@@ -54,7 +56,7 @@ Choice; any factors from 0.1 and 10 on lead to the same minimum."""
 ENOUGH, ENOUGH_OF_EXCESS = 1e-2, 1e-4
 """Decrease of the cost below which the search stops: absolute, and relative to the cost above that of noise.
 
-The cost is twice a log density: 0.01 is a hundredth of what tells two hypotheses apart."""
+Choice: the cost is twice a log density, and 0.01 is a hundredth of what tells two hypotheses apart."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,9 @@ from aeropend_ident.bags import recording
 from aeropend_ident.bags.recording import OFF_GRID, Recording, RecordingError
 
 PAUSE = 10.0
-"""[s] Gap between samples after which the state before it no longer matters: several times what the arm remembers."""
+"""[s] Gap between samples after which the state before it no longer matters.
+
+Choice: several times what the arm remembers."""
 
 IRREGULAR = 0.05
 """Share of the steps between stamps that may fit no sample period (choice)."""

@@ -21,10 +21,10 @@ FEWEST = 10
 """Readings, or differences, below which no noise is estimated (choice)."""
 
 LEAST_NOISE = 1e-9
-"""Smallest standard deviation of a reading in its unit: a residual is divided by it."""
+"""Smallest standard deviation of a reading in its unit (choice: far below any sensor; residuals are divided by it)."""
 
 LONGEST_STEP = 50.0
-"""Steps of the resolution between neighbouring levels, in the median, above which a channel counts as continuous."""
+"""Steps of the resolution between neighbouring levels, in the median, above which a channel is continuous (choice)."""
 
 
 def resolution(x: Array) -> float:

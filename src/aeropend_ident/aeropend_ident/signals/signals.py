@@ -33,7 +33,7 @@ STILL = 0.01
 SETTLED = 0.012
 """[s] Time after a step of the duty in which the current shows when the step came, and little else.
 
-About ten electrical time constants L_a/R_a of the preset `bench`."""
+Choice: about ten electrical time constants L_a/R_a of the preset `bench`."""
 
 SEEN_OVER_STATED = 2.0
 """Ratio of the noise seen to the noise stated above which the noise seen counts (choice).

@@ -10,7 +10,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 Array = NDArray[np.float64]
 
 WINDOW = 5.0
-"""Lag, in autocorrelation times, at which the sum over autocorrelations stops (Sokal, 1997, section 3: 4 to 10)."""
+"""Lag, in autocorrelation times, at which their sum stops (convention: Sokal, 1997, section 3: 4 to 10)."""
 
 FEWEST = 16
 """Samples below which no autocorrelation is estimated: the series then counts in full (choice)."""

@@ -27,7 +27,7 @@ BEHIND_MOTOR = ("mgd_over_J", "c_over_J", "L_over_J", "initial.theta", "initial.
 """Values that act behind the motor."""
 
 KEPT = 2
-"""Runs of the motor that are kept: at the point of a search, and at its last trial."""
+"""Runs of the motor that are kept (derived: one at the point of a search, one at its last trial)."""
 
 
 class CachedChain(CutChain):

@@ -33,7 +33,7 @@ DELAY = "command_delay.delay"
 """The one value of the actuator that acts between samples, where only the motor shows it."""
 
 RAN_AWAY = 1e9
-"""Residual, in the unit of the channel, of a simulation that is not finite."""
+"""Residual, in the unit of the channel, of a simulation that is not finite (choice: larger than any reading)."""
 
 VOLTAGE_SETTLES, SPEED_SETTLES = 0.05, 0.02
 """[s] Windows over which the rest of voltage and speed is averaged before it feeds the next stage.

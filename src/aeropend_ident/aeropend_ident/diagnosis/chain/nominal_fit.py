@@ -51,7 +51,7 @@ ROUNDS = 4
 """Rounds of the fits over each horizon; the last fit of a search has more (choice)."""
 
 COARSE = 0.01
-"""[s] Sample period of the data that a search starts with: far below the arm's time constants."""
+"""[s] Sample period of the data that a search starts with (choice: far below the arm's time constants)."""
 
 TEST_FUNCTIONS = (0.25, 0.5)
 """[s] Half-widths of the test functions of the weak form: a quarter and a half of a usual period of the arm."""
@@ -66,7 +66,9 @@ WIDER = 2.0
 """Factor on the standard deviations of the priors while a nominal model is searched (choice)."""
 
 WINDING_SETTLES = 0.1
-"""[s] Blocks over which voltage, current and speed are averaged for a start: longer than any winding's L_a/R_a."""
+"""[s] Blocks over which voltage, current and speed are averaged for a start.
+
+Choice: longer than any winding's L_a/R_a."""
 
 SCATTER, MINIMUM_FREEDOM = 1.3, 30
 """Ratio of the scatter around a smooth swing to a reading's noise above which it counts as the noise, and the degrees
@@ -83,10 +85,12 @@ HANGS = 0.1
 """[rad] An arm that starts nearer to hanging than this is taken to start with a rotor that stands (choice)."""
 
 CURVE = 11
-"""Points of the static curve from duty to lift that is reported."""
+"""Points of the static curve from duty to lift that is reported (choice)."""
 
 FULL = 2.3
-"""[V] Voltage at full duty of a rig without a measured voltage: only its product with other parameters acts."""
+"""[V] Voltage at full duty of a rig without a measured voltage.
+
+Choice: only its product with other parameters acts."""
 
 
 def fit_nominal_model(model: Model, recordings: Sequence[Signals]) -> tuple[Model, list[Signals]]:

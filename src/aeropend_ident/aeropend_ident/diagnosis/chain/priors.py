@@ -18,10 +18,14 @@ from aeropend_sim.model import actuator
 from aeropend_sim.model.parameters import PARAMETERS, Model
 
 NOMINAL_SD = 0.03
-"""Relative standard deviation of a calibrated parameter: that of a uniform distribution over ±5 %, 0.05/√3."""
+"""Relative standard deviation of a calibrated parameter.
+
+Derived: that of a uniform distribution over ±5 %, 0.05/√3."""
 
 UNCALIBRATED_SD = 0.55
-"""Standard deviation of the logarithm of an uncalibrated parameter: a factor of three is two of it, ln(3)/2."""
+"""Standard deviation of the logarithm of an uncalibrated parameter.
+
+Derived: a factor of three is two standard deviations, ln(3)/2."""
 
 ZERO = "angle_offset.bias"
 """The angle that is read while the arm hangs; for a free decay a parameter like any other."""
@@ -43,10 +47,12 @@ HEAVIEST = 8.0
 """Largest ratio of the voltages for load and back-EMF at full duty (choice: propellers have 0.1 to 4)."""
 
 QUICKEST = 0.015
-"""[s] Shortest time constant of the rotor without load; a shorter one cannot be told from none at 60 Hz."""
+"""[s] Shortest time constant of the rotor without load.
+
+Choice: at 60 Hz a shorter one looks like none."""
 
 STRAIGHT = 2.0
-"""Largest ratio k3/k2: the map from duty to voltage is then straight to 3 % of its range (its formula)."""
+"""Largest ratio k3/k2 (derived: the formula for the voltage is then straight to 3 % of its range)."""
 
 FIRST_READINGS = 0.08
 """[s] Time at the beginning from which the arm's initial state is estimated (choice)."""

@@ -14,10 +14,10 @@ from aeropend_ident.diagnosis.report.number_format import Tick
 Array = NDArray[np.float64]
 
 WIDTH, HEIGHT = 1600, 400
-"""Size of a drawing in units of its own; the page stretches it."""
+"""Size of a drawing in units of its own; the page stretches it (layout)."""
 
 MARGIN = 0.06
-"""Space above and below a line, as a share of its height (choice)."""
+"""Space above and below a line, as a share of its height (layout)."""
 
 GAP = 5.0
 """Distance between two readings, in their usual distance, from which they are not connected (choice)."""

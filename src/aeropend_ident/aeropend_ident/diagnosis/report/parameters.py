@@ -10,7 +10,9 @@ from aeropend_ident.diagnosis.report.number_format import exact, interval, quant
 from aeropend_sim.model.parameters import PARAMETERS
 
 OFF = 0.05
-"""Relative shift above which a parameter is marked: the tolerance that the priors of calibrated rigs assume."""
+"""Relative shift above which a parameter is marked.
+
+Derived: the tolerance that the priors of calibrated rigs assume."""
 
 
 @dataclass(frozen=True)

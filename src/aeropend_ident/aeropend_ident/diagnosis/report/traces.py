@@ -23,13 +23,13 @@ MOST_TRACES = 4
 """Recordings whose traces are drawn at most (choice: more make the page long)."""
 
 COLUMNS = 800
-"""Columns of a trace that is drawn without JavaScript; each shows minimum and maximum (choice)."""
+"""Columns of a trace that is drawn without JavaScript; each shows minimum and maximum (layout)."""
 
 FEWEST_COLUMNS = 300
-"""The same at least, where several recordings share the page (choice)."""
+"""The same at least, where several recordings share the page (layout)."""
 
 ZOOM_VALUES = 250_000
-"""Values kept for zooming, over all traces (choice: 2.7 bytes each keep the page below a megabyte)."""
+"""Values kept for zooming, over all traces (memory): 2.7 bytes each keep the page below a megabyte."""
 
 FEWEST_HELD_OUT = 10
 """Held-out samples up to which the whole recording is drawn instead (choice)."""

@@ -19,7 +19,7 @@ MOSTLY_OPEN = 0.5
 """Share of the gap below which the page explains why a random effect leaves the rest open (choice)."""
 
 SAME_END = 1e-3
-"""Width of the interval of a share below which the interval is not shown: its ends would be the same text."""
+"""Width of the interval of a share below which the interval is not shown (derived: its ends would be the same text)."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,9 @@ KNOTS = 9
 """Knots of a curve, at quantiles of its variable (choice: more draw noise, fewer miss a dead zone)."""
 
 STIFF = 1e-3
-"""Weight of the prior on each value of a curve, per thousand samples: it holds a curve where there are no data."""
+"""Weight of the prior on each value of a curve, per thousand samples.
+
+Choice: it holds a curve where there are no data."""
 
 MOMENT = 0.2
 """[s] Distance of the knots of a term that is free in time (choice: shorter than the arm's period)."""
@@ -54,10 +56,12 @@ CHANCE = 3.0
 """Ratio of the share that curves explain of a residual to that of white noise above which it counts (choice)."""
 
 MOST_SAMPLES = 100_000
-"""Samples of training data in which missing terms are sought: all curves have to fit into memory at once."""
+"""Samples of training data in which missing terms are sought.
+
+Choice: all curves have to fit into memory at once."""
 
 MOST_SAMPLES_FREE_IN_TIME = 25_000
-"""The same for a term that is free in time, whose knots grow with the time."""
+"""The same for a term that is free in time (choice: its knots grow in number with the time)."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from aeropend_sim.model.dynamics import linear_arm
 Array = NDArray[np.float64]
 
 STEP = 0.01
-"""[s] Time between the residuals that the filter takes: a fiftieth of the arm's usual period."""
+"""[s] Time between the residuals that the filter takes (choice: a fiftieth of the arm's usual period)."""
 
 SETTLED = 1.0
 """[s] Time after which the filter has forgotten its initial state (choice: some time constants of the arm)."""

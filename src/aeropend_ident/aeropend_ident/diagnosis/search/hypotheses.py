@@ -17,7 +17,9 @@ from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
 from aeropend_sim.model.parameters import PARAMETERS, Model
 
 MISMATCH_SD = 0.3
-"""Relative standard deviation of a parameter that `parameter_mismatch` blames: ten times that of a calibrated one."""
+"""Relative standard deviation of a parameter that `parameter_mismatch` blames.
+
+Choice: ten times that of a calibrated one."""
 
 EFFECT_ODDS = 1.0 / 50.0
 """Prior odds of one given effect against no further effect: about even for the catalogue as a whole (choice).
@@ -31,7 +33,7 @@ FIRST_SIZE = 0.3
 """Size, in default sizes, from which a search starts (choice)."""
 
 SAME = 1e-6
-"""Change of a residual, in units of a reading's noise, that is rounding."""
+"""Change of a residual, in units of a reading's noise, that is rounding (choice)."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ FOLLOWS = 0.01
 Choice: so little does not change a verdict, and is far above chance with some thousand samples."""
 
 OUTSIDE = 3.0
-"""Standard deviations of its prior by which a parameter must be off to count as outside the prior: 99.7 %."""
+"""Standard deviations of its prior by which a parameter must be off to be outside the prior (convention: 99.7 %)."""
 
 MOST_EFFECTS = 3
 """Effects that are searched in one stage (choice)."""
@@ -36,10 +36,12 @@ CUT_SHORT_ROUNDS = 2
 """Rounds of the last fits when the budget is spent (choice)."""
 
 BETTER_ALONE = 1.0
-"""Log evidence by which the fit without an effect must improve from a rival's parameters to replace the old one."""
+"""Log evidence by which the fit without an effect must improve from a rival's parameters to replace it (choice)."""
 
 EVEN = 0.5
-"""Probability of all hypotheses of a round together above which an effect is found: more likely than not."""
+"""Probability of all hypotheses of a round together above which an effect is found.
+
+Derived: an effect is then more likely than none."""
 
 
 def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], None] = lambda *_: None

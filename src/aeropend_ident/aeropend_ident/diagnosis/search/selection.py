@@ -45,7 +45,9 @@ FORM_SHOWS = 1.2
 """Mean square residual, in units of a reading's noise, above which an effect's form does not fit (choice)."""
 
 MISPLACED = 2.0
-"""Standard deviations of its prior beyond which a parameter is tried as a mismatch in any case: 95 %."""
+"""Standard deviations of its prior beyond which a parameter is tried as a mismatch in any case.
+
+Convention: 95 %."""
 
 INSIDE = 0.3
 """Part of a parameter's range from which a search starts if only the product with the size is certain (choice)."""

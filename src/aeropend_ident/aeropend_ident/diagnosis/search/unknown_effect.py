@@ -23,7 +23,7 @@ from aeropend_ident.estimation.parameter import Parameter, key
 Array = NDArray[np.float64]
 
 BY_CHANCE = 3.0
-"""Standard deviations of a mean square that pass as chance: 99.7 %."""
+"""Standard deviations of a mean square that pass as chance (convention: 99.7 %)."""
 
 VISIBLE = 0.005
 """RMS of a channel's misfit, relative to the channel's spread, above which it matters (choice)."""
