@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far verdicts depend on each decision threshold of the diagnosis."""

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far verdicts depend on each decision threshold: diagnose recordings with each one at 70 % and at 130 %.
+
+python -m evaluation.sensitivity                  about an hour on two cores; goes on where it was stopped
+python -m evaluation.sensitivity --minutes 20     what 20 minutes allow, the thresholds of the search first
+python -m evaluation.sensitivity --only search.   thresholds whose name holds this
+python -m evaluation.sensitivity --list           every threshold with its origin; diagnoses nothing
+python -m evaluation.sensitivity --docs           write docs/results/thresholds.md from what was measured
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import inspect
+import json
+import os
+import time
+from collections.abc import Iterator, Mapping
+from datetime import date
+from pathlib import Path
+from typing import Any
+
+from joblib import Parallel, delayed
+
+from evaluation import results
+from evaluation.sensitivity import page, reads, recordings
+from evaluation.sensitivity.changed import changed, new_constant
+from evaluation.sensitivity.thresholds import Threshold, modules, thresholds
+
+RESULTS = results.ROOT / "sensitivity-results"
+PAGE = results.ROOT / "docs" / "results" / "thresholds.md"
+
+FIRST = ("policy.", "search.search.", "search.selection.", "search.hypotheses.", "search.unknown_effect.",
+         "search.gust.", "search.speed_spikes.", "joint_fit.", "search.", "pwm_timing.", "priors.", "noise.", "pulses.",
+         "outliers.", "free_decay.", "signals.signals.", "statistics.", "nominal_fit.", "chain.", "regions.",
+         "conclude.", "map_fit.", "from_bag.", "grid.")
+"""Parts of names of thresholds, in the order in which they are measured; the rest comes last."""
+
+Task = tuple[Threshold, float, list[str], list[str]]
+"""Threshold, factor, and the recordings that it acts on: in full, and from the identified nominal model on."""
+
+
+def unchanged(folder: Path, jobs: int) -> dict[str, Any]:
+    """Make the recordings and diagnose them with unchanged thresholds; read what was kept if the source is the same."""
+    kept, source = folder / "unchanged.json", digest()
+    if kept.exists() and (body := json.loads(kept.read_text(encoding="utf-8")))["source"] == source:
+        return body
+
+    def one(name: str) -> tuple[str, dict[str, Any]]:
+        recordings.make(folder, name)
+        verdict = recordings.diagnosed(folder, name, keep=True)
+        with reads.watched() as seen:
+            recordings.diagnosed(folder, name)
+        return name, {"verdict": verdict, "lines": {part: sorted(lines) for part, lines in seen.items()}}
+
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / ".gitignore").write_text("*\n", encoding="utf-8")
+    rows = dict(Parallel(jobs)(delayed(one)(name) for name in recordings.NAMES))
+    body = {"commit": results.first_line("git", "rev-parse", "--short", "HEAD"),
+            "date": date.today().isoformat(), "source": source, "recordings": rows}
+    kept.write_text(json.dumps(body), encoding="utf-8")
+    return body
+
+
+def digest() -> str:
+    """Of the source of the diagnosis: numbers of lines hold for one source only."""
+    return hashlib.sha256("".join(inspect.getsource(m) for m in modules()).encode()).hexdigest()
+
+
+def tasks(found: list[Threshold], rows: Mapping[str, Any]) -> Iterator[Task]:
+    """What is to be diagnosed, the most important first; thresholds that cannot act on a recording are left out."""
+    lines = {name: {part: {tuple(line) for line in row["lines"][part]} for part in row["lines"]}
+             for name, row in rows.items()}
+    for threshold in sorted(found, key=_rank):
+        if page.not_varied(threshold):
+            continue
+        read = reads.lines_of(threshold)
+        late = [n for n in rows if not recordings.is_calibrated(n) and read & lines[n][reads.AFTER]
+                and not read & lines[n][reads.BEFORE]]
+        full = [n for n in rows if n not in late and read & (lines[n][reads.BEFORE] | lines[n][reads.AFTER])]
+        for factor in page.FACTORS:
+            yield threshold, factor, full, late
+
+
+def _rank(threshold: Threshold) -> int:
+    return next((k for k, part in enumerate(FIRST) if part in f"{threshold.id}."), len(FIRST))
+
+
+def varied(folder: Path, task: Task, deadline: float) -> dict[str, Any] | None:
+    """The verdicts with one changed threshold; None: the time was up before."""
+    threshold, factor, full, late = task
+    if time.time() > deadline:
+        return None
+    value = threshold.scaled(factor)
+    with changed(threshold.module, threshold.constant, new_constant(threshold, value)):
+        verdicts = {name: recordings.diagnosed(folder, name, kept=name in late) for name in [*full, *late]}
+    return {"threshold": threshold.id, "of": threshold.value, "factor": factor, "value": value, "verdicts": verdicts}
+
+
+def measured(folder: Path) -> dict[tuple[str, float], dict[str, Any]]:
+    """The results so far, by threshold and factor; those of other values are left out."""
+    path = folder / "varied.jsonl"
+    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+    now = {(t.id, factor): [t.value, t.scaled(factor)] for t in thresholds() for factor in page.FACTORS}
+    return {k: r for r in rows if now.get(k := (r["threshold"], r["factor"])) == [r["of"], r["value"]]}
+
+
+def run(folder: Path, jobs: int, minutes: float, only: str) -> None:
+    """Diagnose with each threshold changed, and append each result to a file as it comes."""
+    deadline = time.time() + 60.0 * minutes
+    rows = unchanged(folder, jobs)["recordings"]
+    have = measured(folder)
+    left = [t for t in tasks(thresholds(), rows) if (t[0].id, t[1]) not in have and only in t[0].id]
+    print(f"{len(left)} changes of thresholds to diagnose, {sum(len(t[2]) + len(t[3]) for t in left)} diagnoses")
+    with (folder / "varied.jsonl").open("a", encoding="utf-8") as out:
+        for row in Parallel(jobs, return_as="generator_unordered", batch_size=1)(
+                delayed(varied)(folder, task, deadline) for task in left):
+            if row is not None:
+                out.write(json.dumps(row) + "\n")
+                out.flush()
+
+
+def main() -> None:
+    """Measure, list, or write the page."""
+    parser = argparse.ArgumentParser(prog="sensitivity", description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder of recordings and results")
+    parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
+    parser.add_argument("--minutes", type=float, default=600.0, help="time after which no further change is begun")
+    parser.add_argument("--only", default="", help="thresholds whose name holds this")
+    parser.add_argument("--list", action="store_true", help="list every threshold with its origin")
+    parser.add_argument("--docs", action="store_true", help=f"write {PAGE.relative_to(results.ROOT)}")
+    options = parser.parse_args()
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    if options.list:
+        for t in thresholds():
+            print(f"{t.id} = {t.value:g}{f' {t.unit}' if t.unit else ''}: {', '.join(t.origins) or 'NO ORIGIN'}")
+    elif options.docs:
+        before = json.loads((options.out / "unchanged.json").read_text(encoding="utf-8"))
+        PAGE.write_text(page.page(thresholds(), before, measured(options.out)), encoding="utf-8")
+    else:
+        run(options.out, options.jobs, options.minutes, options.only)
+
+
+if __name__ == "__main__":
+    main()
