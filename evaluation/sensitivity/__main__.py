@@ -17,6 +17,7 @@ import json
 import os
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -37,15 +38,34 @@ FIRST = ("policy.", "search.search.", "search.selection.", "search.hypotheses.",
          "conclude.", "map_fit.", "from_bag.", "grid.")
 """Parts of names of thresholds, in the order in which they are measured; the rest comes last."""
 
-Task = tuple[Threshold, float, list[str], list[str]]
-"""Threshold, factor, and the recordings that it acts on: in full, and from the identified nominal model on."""
+@dataclass(frozen=True)
+class Task:
+    """A change of a threshold, and the recordings that are still to be diagnosed with it.
+
+    Attributes:
+        threshold: that is changed.
+        factor: on its value.
+        full: recordings that it acts on from the beginning.
+        late: recordings that it acts on from the identified nominal model on.
+        considered: these, and those that it cannot act on.
+    """
+
+    threshold: Threshold
+    factor: float
+    full: list[str]
+    late: list[str]
+    considered: list[str]
 
 
 def unchanged(folder: Path, jobs: int) -> dict[str, Any]:
-    """Make the recordings and diagnose them with unchanged thresholds; read what was kept if the source is the same."""
+    """Make the recordings and diagnose them with unchanged thresholds, once for each source of the diagnosis.
+
+    If another source gives other verdicts, the results with changed thresholds are out of date, and are removed.
+    """
     kept, source = folder / "unchanged.json", digest()
-    if kept.exists() and (body := json.loads(kept.read_text(encoding="utf-8")))["source"] == source:
-        return body
+    old: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else {"recordings": {}}
+    if old.get("source") == source:
+        return old
 
     def one(name: str) -> tuple[str, dict[str, Any]]:
         recordings.make(folder, name)
@@ -57,8 +77,10 @@ def unchanged(folder: Path, jobs: int) -> dict[str, Any]:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / ".gitignore").write_text("*\n", encoding="utf-8")
     rows = dict(Parallel(jobs)(delayed(one)(name) for name in recordings.NAMES))
-    body = {"commit": results.first_line("git", "rev-parse", "--short", "HEAD"),
-            "date": date.today().isoformat(), "source": source, "recordings": rows}
+    body: dict[str, Any] = {"commit": results.first_line("git", "rev-parse", "--short", "HEAD"),
+                            "date": date.today().isoformat(), "source": source, "recordings": rows}
+    if any(row["verdict"] != rows[name]["verdict"] for name, row in old["recordings"].items()):
+        (folder / "varied.jsonl").unlink(missing_ok=True)
     kept.write_text(json.dumps(body), encoding="utf-8")
     return body
 
@@ -68,19 +90,22 @@ def digest() -> str:
     return hashlib.sha256("".join(inspect.getsource(m) for m in modules()).encode()).hexdigest()
 
 
-def tasks(found: list[Threshold], rows: Mapping[str, Any]) -> Iterator[Task]:
-    """What is to be diagnosed, the most important first; thresholds that cannot act on a recording are left out."""
+def tasks(found: list[Threshold], rows: Mapping[str, Any], have: page.Rows) -> Iterator[Task]:
+    """What is still to be diagnosed, the most important first."""
     lines = {name: {part: {tuple(line) for line in row["lines"][part]} for part in row["lines"]}
              for name, row in rows.items()}
     for threshold in sorted(found, key=_rank):
         if page.not_varied(threshold):
             continue
         read = reads.lines_of(threshold)
-        late = [n for n in rows if not recordings.is_calibrated(n) and read & lines[n][reads.AFTER]
-                and not read & lines[n][reads.BEFORE]]
-        full = [n for n in rows if n not in late and read & (lines[n][reads.BEFORE] | lines[n][reads.AFTER])]
         for factor in page.FACTORS:
-            yield threshold, factor, full, late
+            done = have.get((threshold.id, factor), {"considered": ()})["considered"]
+            left = [n for n in rows if n not in done]
+            late = [n for n in left if not recordings.is_calibrated(n) and read & lines[n][reads.AFTER]
+                    and not read & lines[n][reads.BEFORE]]
+            full = [n for n in left if n not in late and read & (lines[n][reads.BEFORE] | lines[n][reads.AFTER])]
+            if left:
+                yield Task(threshold, factor, full, late, left)
 
 
 def _rank(threshold: Threshold) -> int:
@@ -89,13 +114,13 @@ def _rank(threshold: Threshold) -> int:
 
 def varied(folder: Path, task: Task, deadline: float) -> dict[str, Any] | None:
     """The verdicts with one changed threshold; None: the time was up before."""
-    threshold, factor, full, late = task
     if time.time() > deadline:
         return None
-    value = threshold.scaled(factor)
-    with changed(threshold.module, threshold.constant, new_constant(threshold, value)):
-        verdicts = {name: recordings.diagnosed(folder, name, kept=name in late) for name in [*full, *late]}
-    return {"threshold": threshold.id, "of": threshold.value, "factor": factor, "value": value, "verdicts": verdicts}
+    t, value = task.threshold, task.threshold.scaled(task.factor)
+    with changed(t.module, t.constant, new_constant(t, value)):
+        verdicts = {name: recordings.diagnosed(folder, name, kept=name in task.late) for name in task.full + task.late}
+    return {"threshold": t.id, "of": t.value, "factor": task.factor, "value": value, "considered": task.considered,
+            "verdicts": verdicts}
 
 
 def measured(folder: Path) -> dict[tuple[str, float], dict[str, Any]]:
@@ -103,16 +128,22 @@ def measured(folder: Path) -> dict[tuple[str, float], dict[str, Any]]:
     path = folder / "varied.jsonl"
     rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
     now = {(t.id, factor): [t.value, t.scaled(factor)] for t in thresholds() for factor in page.FACTORS}
-    return {k: r for r in rows if now.get(k := (r["threshold"], r["factor"])) == [r["of"], r["value"]]}
+    found: dict[tuple[str, float], dict[str, Any]] = {}
+    for row in rows:
+        key = row["threshold"], row["factor"]
+        if now.get(key) == [row["of"], row["value"]]:
+            entry = found.setdefault(key, {"considered": [], "verdicts": {}})
+            entry["considered"] += row["considered"]
+            entry["verdicts"] |= row["verdicts"]
+    return found
 
 
 def run(folder: Path, jobs: int, minutes: float, only: str) -> None:
     """Diagnose with each threshold changed, and append each result to a file as it comes."""
-    deadline = time.time() + 60.0 * minutes
     rows = unchanged(folder, jobs)["recordings"]
-    have = measured(folder)
-    left = [t for t in tasks(thresholds(), rows) if (t[0].id, t[1]) not in have and only in t[0].id]
-    print(f"{len(left)} changes of thresholds to diagnose, {sum(len(t[2]) + len(t[3]) for t in left)} diagnoses")
+    deadline = time.time() + 60.0 * minutes
+    left = [t for t in tasks(thresholds(), rows, measured(folder)) if only in t.threshold.id]
+    print(f"{len(left)} changes of thresholds to diagnose, {sum(len(t.full) + len(t.late) for t in left)} diagnoses")
     with (folder / "varied.jsonl").open("a", encoding="utf-8") as out:
         for row in Parallel(jobs, return_as="generator_unordered", batch_size=1)(
                 delayed(varied)(folder, task, deadline) for task in left):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from textwrap import fill
 from typing import Any
 
-from evaluation.sensitivity.recordings import RECORDINGS
+from evaluation.sensitivity.recordings import DURATION, FAINT, RECORDINGS
 from evaluation.sensitivity.thresholds import Threshold
 
 FACTORS = (0.7, 1.3)
@@ -19,7 +19,7 @@ AFTERWARDS = ("diagnosis.report.", "diagnosis.experiment_design.", "diagnosis.ba
 """Modules that run after the verdict, or beside it."""
 
 Rows = Mapping[tuple[str, float], Mapping[str, Any]]
-"""Threshold and factor -> its verdicts by recording."""
+"""Threshold and factor -> "considered": recordings, and "verdicts": of those of them that it can act on."""
 
 
 def not_varied(threshold: Threshold) -> str:
@@ -29,8 +29,8 @@ def not_varied(threshold: Threshold) -> str:
     return "" if threshold.value else "is zero"
 
 
-KINDS = {"calibrated": "calibrated rigs", "driven": "uncalibrated rigs, with the angle and the command alone",
-         "decay": "free decays"}
+KINDS = {"calibrated": "calibrated rigs", "faint": "calibrated rigs with faint effects",
+         "driven": "uncalibrated rigs with the angle and the command alone", "decay": "free decays"}
 """Kind of rig in `RECORDINGS` -> words."""
 
 COLUMNS = ("threshold", "value", "unit", "origin", "read in", "right ×0.7 / ×1 / ×1.3",
@@ -43,8 +43,8 @@ NOTES = (
     decisions" are the regions that are reported, the pairs of hypotheses that are not separable, the number of reasons
     for an unknown effect, and the parameters that are determined; they are counted where the verdict is the same.""",
     """`GROWTH`, `PEAK`, `NOTICEABLE`, `FORM_SHOWS`, `SCATTER` and `GOOD_ENOUGH` are ratios near 1. Times 0.7 they are
-    below 1: pure noise then counts as a misfit, or an arm that loses energy as pushed. A change of the verdict there is
-    expected.""")
+    below 1: pure noise then counts as a misfit, and a free swing as a push. A change of the verdict is then expected.
+    """)
 """What the table does not say itself."""
 
 MANY = 2
@@ -57,12 +57,16 @@ class Outcome:
 
     Attributes:
         right: number of right verdicts.
+        base: the same with the unchanged threshold.
+        of: number of recordings.
         changed: recordings whose verdict (effects found, first effect, place) changed.
         besides: recordings whose other decisions changed: regions, rivals not ruled out, parameters determined.
         read: number of recordings whose diagnosis reads the threshold.
     """
 
     right: int
+    base: int
+    of: int
     changed: tuple[str, ...]
     besides: tuple[str, ...]
     read: int
@@ -73,10 +77,12 @@ def outcome(rows: Rows, before: Mapping[str, Any], threshold: Threshold, factor:
     row = rows.get((threshold.id, factor))
     if row is None:
         return None
-    after = {name: row["verdicts"].get(name, verdict) for name, verdict in before.items()}
-    changed = tuple(n for n in before if after[n]["answer"] != before[n]["answer"])
-    besides = tuple(n for n in before if n not in changed and after[n]["besides"] != before[n]["besides"])
-    return Outcome(sum(v["right"] for v in after.values()), changed, besides, len(row["verdicts"]))
+    names = [n for n in before if n in row["considered"]]
+    after = {n: row["verdicts"].get(n, before[n]) for n in names}
+    changed = tuple(n for n in names if after[n]["answer"] != before[n]["answer"])
+    besides = tuple(n for n in names if n not in changed and after[n]["besides"] != before[n]["besides"])
+    return Outcome(sum(after[n]["right"] for n in names), sum(before[n]["right"] for n in names), len(names), changed,
+                   besides, len(row["verdicts"]))
 
 
 def page(found: Sequence[Threshold], unchanged: Mapping[str, Any], rows: Rows) -> str:
@@ -97,12 +103,12 @@ def page(found: Sequence[Threshold], unchanged: Mapping[str, Any], rows: Rows) -
     rest = [(t, not_varied(t) or ("not read in these diagnoses" if t.id in both else "not measured"))
             for t in found if t not in varied]
     right = sum(v["right"] for v in before.values())
-    table = [f"| {' | '.join(COLUMNS)} |", "| --- " * len(COLUMNS) + "|", *(_row(t, both[t.id], right) for t in varied)]
+    table = [f"| {' | '.join(COLUMNS)} |", "| --- " * len(COLUMNS) + "|", *(_row(t, both[t.id]) for t in varied)]
     unvaried = ["| threshold | value | unit | origin | why |", "| --- | --- | --- | --- | --- |"]
     unvaried += [f"| `{t.id}` | {t.value:g} | {t.unit} | {', '.join(t.origins)} | {why} |" for t, why in rest]
     return "\n\n".join([
         "# Decision thresholds and their sensitivity", *map(_wrapped, _introduction(unchanged, len(before), right)),
-        "## What the verdict depends on", _wrapped(_summary(varied, both, right, len(before))),
+        "## What the verdict depends on", _wrapped(_summary(varied, both)),
         "## Thresholds that were varied", *map(_wrapped, NOTES), "\n".join(table),
         "## Thresholds that were not varied", "\n".join(unvaried)]) + "\n"
 
@@ -114,27 +120,27 @@ def _wrapped(text: str) -> str:
 def _introduction(unchanged: Mapping[str, Any], count: int, right: int) -> list[str]:
     kinds = [sum(row[0] == kind for row in RECORDINGS) for kind in KINDS]
     parts = ", ".join(f"{n} of {words}" for n, words in zip(kinds, KINDS.values(), strict=True))
-    return [f"""Measured on {unchanged['date']} at commit {unchanged['commit']} by `python -m evaluation.sensitivity`.
-        `python -m evaluation.sensitivity --docs` writes this page.""",
+    return [f"""Measured on {unchanged['date']} with the diagnosis of commit {unchanged['commit']} by
+        `python -m evaluation.sensitivity`. `python -m evaluation.sensitivity --docs` writes this page.""",
         f"""Each threshold of the diagnosis was multiplied by 0.7 and by 1.3, one at a time, and {count} simulated
         recordings were diagnosed with it: {parts}. The generator is that of `make blind`; no constant was tuned on
-        these recordings. Of the calibrated rigs two have no effect, two have two effects, and two have one outside the
-        catalogue. A driven recording lasts 25 s.""",
+        these recordings. The calibrated rigs have one effect, two effects, none, or one outside the catalogue. After a
+        refit of the parameters, a faint effect leaves a gap of {FAINT[0]:g} to {FAINT[1]:g} times the noise floor; the
+        others leave 1.5 to 10 times the floor. A driven recording lasts {DURATION:g} s.""",
         f"""A verdict is right if it names all effects and no other, and the place of one of them. With unchanged
         thresholds {right} of {count} verdicts are right. The set is small: a threshold that changes nothing here may
-        change the verdict on a recording whose effect is hardly visible. The table shows which thresholds matter; it
-        gives no error rates."""]
+        change the verdict on another recording. The table shows which thresholds matter; it gives no error rates."""]
 
 
-def _summary(varied: Sequence[Threshold], both: Mapping[str, tuple[Outcome, ...]], right: int, count: int) -> str:
+def _summary(varied: Sequence[Threshold], both: Mapping[str, tuple[Outcome, ...]]) -> str:
     def most(t: Threshold) -> int:
         return max(len(o.changed) for o in both[t.id])
 
     same = sum(most(t) == 0 for t in varied)
-    fall = sum(any(o.right < right for o in both[t.id]) for t in varied)
+    fall = sum(any(o.right < o.base for o in both[t.id]) for t in varied)
     strong = sorted((t for t in varied if most(t) >= MANY), key=most, reverse=True)
-    text = (f"Of {len(varied)} thresholds, {same} change no verdict at ±30 %; {len(varied) - same} change at least one "
-            f"of {count}; {fall} make at least one right verdict wrong. ")
+    text = (f"Of {len(varied)} thresholds, {same} change no verdict at ±30 %, and {len(varied) - same} change at "
+            f"least one; with {fall} of them, fewer verdicts are right. ")
     if not strong:
         return text + f"None changes {MANY} verdicts or more."
     named = "; ".join(f"`{t.id}` ({_changes(both[t.id])})" for t in strong)
@@ -145,8 +151,8 @@ def _changes(outcomes: Sequence[Outcome]) -> str:
     return ", ".join(f"{len(o.changed)} at ×{f:g}" for f, o in zip(FACTORS, outcomes, strict=True))
 
 
-def _row(t: Threshold, outcomes: Sequence[Outcome], right: int) -> str:
+def _row(t: Threshold, outcomes: Sequence[Outcome]) -> str:
     low, high = outcomes
-    return (f"| `{t.id}` | {t.value:g} | {t.unit} | {', '.join(t.origins)} | {low.read} | "
-            f"{low.right} / {right} / {high.right} | {len(low.changed)} / {len(high.changed)} | "
+    return (f"| `{t.id}` | {t.value:g} | {t.unit} | {', '.join(t.origins)} | {low.read} of {low.of} | "
+            f"{low.right} / {low.base} / {high.right} | {len(low.changed)} / {len(high.changed)} | "
             f"{len(low.besides)} / {len(high.besides)} |")

@@ -21,7 +21,7 @@ from evaluation.sensitivity.changed import aliases, changed, defaults, loaded, u
 from evaluation.sensitivity.thresholds import POLICIES, Threshold, assigned, tree
 
 Line = tuple[str, int]
-"""Name of a module and number of a line; or a policy with a field, and 0."""
+"""Name of a module and number of a line; or a policy with a field, as in CALIBRATED.undecided, and 0."""
 
 BEFORE, AFTER = "before", "after"
 """Parts of a diagnosis: up to the identified nominal model of an uncalibrated rig, and from there on."""
@@ -43,7 +43,7 @@ def lines_of(threshold: Threshold) -> set[Line]:
         for statement in source.body:  # constants that are computed from it
             names = assigned(statement)
             if names and names != [alias] and uses(statement.value, alias):  # type: ignore[attr-defined]
-                found |= {(f"{names[0]}.{field}", 0) for field in _fields(statement)}
+                found |= {(f"{names[0]}.{field}", 0) for field in _fields()}
     for other in loaded():  # read as an attribute of its module
         for node in ast.walk(tree(other)):
             if isinstance(node, ast.Attribute) and node.attr == threshold.constant:
@@ -51,9 +51,8 @@ def lines_of(threshold: Threshold) -> set[Line]:
     return found
 
 
-def _fields(statement: ast.stmt) -> Iterator[str]:
-    """Names of all fields in a policy that a statement makes."""
-    del statement
+def _fields() -> Iterator[str]:
+    """Names of all numbers of a policy."""
     for field in dataclasses.fields(policy.Policy):
         yield field.name
     for field in dataclasses.fields(policy.UnknownLimits):
@@ -97,7 +96,7 @@ def watched() -> Iterator[dict[str, set[Line]]]:
             yield seen
         finally:
             sys.settrace(None)
-            threading.settrace(None)  # type: ignore[arg-type]
+            threading.settrace(None)
 
 
 def _spied(holder: Any, name: str, read: Callable[[str], None]) -> Any:

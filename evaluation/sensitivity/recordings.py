@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import shutil
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -29,6 +30,9 @@ SEED = 4_711_000
 DURATION = 25.0
 """[s] Duration of a driven recording."""
 
+FAINT = (0.15, 0.6)
+"""[floors] Range of the sizes of faint effects: around `MATERIAL`. The others are drawn from 1.5 to 10."""
+
 RECORDINGS: tuple[tuple[str, str, tuple[str, ...], str], ...] = (
     ("calibrated", "none", (), "table"), ("calibrated", "none", (), "table"),
     ("calibrated", "single", ("coulomb_friction",), "other"), ("calibrated", "single", ("thrust_lag",), "table"),
@@ -42,9 +46,13 @@ RECORDINGS: tuple[tuple[str, str, tuple[str, ...], str], ...] = (
     ("decay", "none", ("viscous",), "table"), ("decay", "single", ("coulomb_friction",), "table"),
     ("calibrated", "single", ("ground_effect",), "other"),
     ("calibrated", "two", ("winding_heating", "cable_torque"), "other"),
+    ("faint", "single", ("thrust_exponent",), "other"), ("faint", "single", ("supply_sag",), "table"),
+    ("faint", "single", ("rotor_friction",), "table"), ("faint", "single", ("gust",), "table"),
+    ("faint", "two", ("quadratic_drag", "encoder_lag"), "table"), ("faint", "outside", ("blade_stall",), "table"),
 )
-"""Kind of rig (calibrated, driven with angle and command alone, free decay), kind of label, effects, and form of each.
+"""Kind of rig, kind of label, effects, and form of each.
 
+Kinds of rig: calibrated; calibrated with faint effects; driven with angle and command alone; free decay.
 Names count them. `make blind` holds many more; this set shows which thresholds matter."""
 
 Verdict = Mapping[str, Any]
@@ -55,26 +63,34 @@ NAMES = tuple(f"s{k:02d}" for k in range(len(RECORDINGS)))
 
 
 def make(folder: Path, name: str) -> None:
-    """Write one recording and its label."""
+    """Write one recording and its label, in place of an older one."""
     k = NAMES.index(name)
     rig, kind, effects, form = RECORDINGS[k]
     nominal = load("bench")
     period = plant.PERIOD
-    if rig == "calibrated":
-        case, columns = cases.draw(name, kind, list(effects), form, nominal.model, nominal.sensing, SEED + k, DURATION)
+    if is_calibrated(name):
+        with mock.patch.object(cases, "FLOORS", FAINT if rig == "faint" else cases.FLOORS):
+            case, columns = cases.draw(name, kind, list(effects), form, nominal.model, nominal.sensing, SEED + k,
+                                       DURATION)
         label = case.label()
     elif rig == "driven":
         label, columns, period = uncalibrated.driven(name, effects[0] if effects else "", form, nominal.model,
                                                      nominal.sensing["angle_filter_tau"], SEED + k, DURATION)
     else:
         label, columns, period = uncalibrated.decay(name, effects[0], nominal.model, SEED + k)
+    shutil.rmtree(folder / name, ignore_errors=True)
     bags.write(folder / name, columns, round(period * 1e9))
     (folder / f"{name}.json").write_text(json.dumps(label), encoding="utf-8")
 
 
 def is_calibrated(name: str) -> bool:
     """Whether the recording is of a calibrated rig."""
-    return RECORDINGS[NAMES.index(name)][0] == "calibrated"
+    return RECORDINGS[NAMES.index(name)][0] in ("calibrated", "faint")
+
+
+def is_faint(name: str) -> bool:
+    """Whether its effects are at the limit of what is visible."""
+    return RECORDINGS[NAMES.index(name)][0] == "faint"
 
 
 def diagnosed(folder: Path, name: str, *, keep: bool = False, kept: bool = False) -> Verdict:

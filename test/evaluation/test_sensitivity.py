@@ -91,7 +91,8 @@ def test_a_diagnosis_reads_a_threshold_and_follows_it(tmp_path):
     with changed(speed_spikes.__name__, "FEWEST", 10**6):
         after = recordings.diagnosed(tmp_path, name)
     assert "speed_spikes" not in after["answer"][1]
-    rows = {(fewest.id, f): {"verdicts": {name: v}} for f, v in zip(page.FACTORS, (before, after))}
+    rows = {(fewest.id, f): {"considered": [name], "verdicts": {name: verdict}}
+            for f, verdict in zip(page.FACTORS, (before, after))}
     text = page.page(list(FOUND.values()), {"date": "2026-01-01", "commit": "0", "recordings": {
         name: {"verdict": before}}}, rows)
-    assert "| `diagnosis.search.speed_spikes.FEWEST` | 3 |  | choice | 1 | 1 / 1 / 0 | 0 / 1 |" in text
+    assert "| `diagnosis.search.speed_spikes.FEWEST` | 3 |  | choice | 1 of 1 | 1 / 1 / 0 | 0 / 1 |" in text
