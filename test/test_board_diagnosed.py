@@ -39,6 +39,7 @@ def sampled(effects: dict[str, dict[str, float]], seed: int) -> Signals:
     return from_arrays(columns, SAMPLE_PERIOD, BENCH.sensing)
 
 
+@pytest.mark.promise("Hardware", "A phase-correct PWM is recognised, and is no gap")
 def test_a_nominal_rig_shows_no_effect():
     result = diagnose(BENCH, [sampled({}, 1)], 1)
     assert result.body["which"]["verdict"] == "none"

@@ -180,6 +180,7 @@ def test_a_board_that_says_nothing_blocks_nobody(rig, graph, ends):
     assert int(counters["lost samples"]) > 200  # the board's clock went on
 
 
+@pytest.mark.promise("Hardware", "The motor stops when the host, the bridge or the connection fails")
 def test_unplugged_and_plugged_in_again(rig, graph, ends):
     joints, armature, command = ends
     command(0.4)
@@ -202,6 +203,7 @@ def test_unplugged_and_plugged_in_again(rig, graph, ends):
     assert int(counters["reconnects"]) == int(counted["reconnects"]) + 1
 
 
+@pytest.mark.promise("Hardware", "The motor stops when the host, the bridge or the connection fails")
 def test_a_reset_of_the_board(rig, graph, ends):
     _, armature, command = ends
     command(0.4)
@@ -219,6 +221,7 @@ def test_a_reset_of_the_board(rig, graph, ends):
     assert "the board was reset (reset line)" in rig.bridge.output
 
 
+@pytest.mark.promise("Hardware", "The motor stops when the host, the bridge or the connection fails")
 def test_the_motor_stops_when_the_host_is_killed(graph, tmp_path):
     rig = Rig(graph, tmp_path, *away("killed"))
     try:
@@ -241,6 +244,7 @@ def test_the_motor_stops_when_the_host_is_killed(graph, tmp_path):
         rig.close()
 
 
+@pytest.mark.promise("Hardware", "The motor stops when the host, the bridge or the connection fails")
 def test_it_waits_for_its_board_and_ends_with_the_motor_at_rest(graph, tmp_path):
     path = tmp_path / "tty"
     bridge = Process("bridge", *parameters(port=path, scheme="ssi"), *away("other"))
@@ -267,6 +271,7 @@ def test_it_waits_for_its_board_and_ends_with_the_motor_at_rest(graph, tmp_path)
             board.stop()
 
 
+@pytest.mark.promise("Hardware", "A firmware of another protocol version is refused")
 def test_a_firmware_of_another_version_is_refused(tmp_path):
     board = PtyBoard(tmp_path / "tty", version=9)
     bridge = Process("bridge", *parameters(port=board.path))
@@ -282,6 +287,7 @@ def test_a_firmware_of_another_version_is_refused(tmp_path):
         board.stop()
 
 
+@pytest.mark.promise("Commands", "An input that cannot be used ends a command with one line and exit code 2")
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -298,6 +304,7 @@ def test_bad_parameters_end_in_one_line_and_exit_code_2(start, arguments, expect
     assert expected in line
 
 
+@pytest.mark.promise("Hardware", "`calibrate` measures the zeros of a rig at rest, and refuses others")
 def test_calibrate_measures_a_rig_at_rest_and_the_bridge_takes_the_file(graph, start, tmp_path):
     steady = {"current": 4, "angle": 300, "voltage": -7, "period": 0}
     board = PtyBoard(tmp_path / "tty", sample=lambda duty: steady)

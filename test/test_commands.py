@@ -61,6 +61,7 @@ def test_the_commands_are_those_of_the_four_packages():
         "aeropend_sim", "aeropend_bridge", "aeropend_control", "aeropend_ident"}
 
 
+@pytest.mark.promise("Commands", "`--help` of each command shows examples and exit codes")
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_shows_examples_and_exit_codes(name, capsys):
     text = shown(COMMANDS[name], capsys)
@@ -71,6 +72,7 @@ def test_help_shows_examples_and_exit_codes(name, capsys):
     assert "2 " in codes
 
 
+@pytest.mark.promise("Commands", "The command lines in all documents are valid")
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_command_lines_of_a_document_are_understood(path, capsys):
     """By their help: names of commands, options and parameters."""
@@ -87,12 +89,14 @@ def test_command_lines_of_a_document_are_understood(path, capsys):
         assert [one for one in [*options, *parameters] if one not in told and one not in MODEL] == [], line
 
 
+@pytest.mark.promise("Commands", "`aeropend` lists all commands and runs them")
 def test_aeropend_lists_every_command_once(capsys):
     assert aeropend.main([]) == 0
     listed = re.findall(r"^  (\w+)  ", capsys.readouterr().out, re.MULTILINE)
     assert sorted([*listed, "aeropend"]) == sorted(COMMANDS)
 
 
+@pytest.mark.promise("Commands", "`aeropend` lists all commands and runs them")
 def test_aeropend_runs_a_command_as_its_own_program_does(tmp_path):
     folder = Path(sys.executable).parent
     alone, through = (
@@ -122,6 +126,7 @@ def completions(line: str) -> list[str]:
     return done.stdout.split()
 
 
+@pytest.mark.promise("Commands", "TAB completes commands, options, parameters and effects in bash and zsh")
 @pytest.mark.parametrize(("line", "expected"), [
     ("plant --ros-args -p preset:=", ["bench", "thesis"]),
     ("plant --ros-args -p effects.coulomb_", ["effects.coulomb_friction.accel:="]),
@@ -164,6 +169,7 @@ def zsh_completes(tmp_path_factory):
     os.close(terminal)
 
 
+@pytest.mark.promise("Commands", "TAB completes commands, options, parameters and effects in bash and zsh")
 @pytest.mark.parametrize(("line", "completed"), [
     ("plant --ros-args -p preset:=th", "plant --ros-args -p preset:=thesis"),
     ("plant --ros-args -p effects.coulomb_friction.a", "plant --ros-args -p effects.coulomb_friction.accel:="),

@@ -122,6 +122,7 @@ def set_parameters(graph, **values):
     return graph.call(SetParameters, f"/{FL}/set_parameters", request).results
 
 
+@pytest.mark.promise("Control", "A reference out of range is refused, and the former one stays")
 def test_a_reference_out_of_range_is_refused_and_the_arm_stays(loop, running):
     for nonsense in (math.nan, math.inf, -0.1, 9.0):
         loop.refer(nonsense)
@@ -137,6 +138,7 @@ BAD_GAINS = {"kp": (-5.0, "out of range"), "ki": (math.nan, "ki"), "thrust_time"
              "angle_limit": (9.0, "out of range"), "reference_max": (0.0, "reference_min < reference_max")}
 
 
+@pytest.mark.promise("Control", "A wrong gain or limit is refused with the reason, and the loop continues")
 def test_a_bad_gain_or_limit_is_refused_with_a_reason_and_the_loop_goes_on(graph, loop):
     request = GetParameters.Request(names=list(BAD_GAINS))
     before = [value.double_value for value in graph.call(GetParameters, f"/{FL}/get_parameters", request).values]
@@ -154,6 +156,7 @@ def test_a_bad_gain_or_limit_is_refused_with_a_reason_and_the_loop_goes_on(graph
     assert "read-only" in result.reason
 
 
+@pytest.mark.promise("Control", "A wrong gain or limit is refused with the reason, and the loop continues")
 def test_a_gain_changes_without_a_bump(graph, loop):
     loop.stays(0.4, 0.02)
     request = GetParameters.Request(names=["kp", "ki", "kd"])
@@ -179,6 +182,7 @@ def test_off_and_on_again_is_like_a_first_step(graph, loop):
     loop.said(FL, "ok")
 
 
+@pytest.mark.promise("Control", "Beyond the angle limit the duty is 0 until the next reference")
 def test_beyond_the_angle_limit_the_arm_is_let_down_until_the_next_reference(graph, loop):
     assert set_parameters(graph, angle_limit=0.5)[0].successful
     try:
@@ -192,6 +196,7 @@ def test_beyond_the_angle_limit_the_arm_is_let_down_until_the_next_reference(gra
         set_parameters(graph, angle_limit=1.4)
 
 
+@pytest.mark.promise("Control", "Without samples for 50 ms the duty is 0, and the law starts anew with the next sample")
 def test_a_plant_that_stands_still_gets_duty_0(loop, running):
     logged = running.controller.output.count("no sample for 0.05 s")
     running.plant.send(signal.SIGSTOP)
@@ -207,6 +212,7 @@ def test_a_plant_that_stands_still_gets_duty_0(loop, running):
     assert running.controller.output.count("no sample for 0.05 s") <= logged + 1
 
 
+@pytest.mark.promise("Control", "A second publisher of `duty_command` is reported")
 def test_another_who_commands_the_duty_is_told_of(graph, loop, running):
     with graph.talking(Float64, DUTY_COMMAND):
         loop.said(FL, "2 publishers of duty_command")
@@ -214,6 +220,7 @@ def test_another_who_commands_the_duty_is_told_of(graph, loop, running):
     assert running.controller.output.count("2 publishers of duty_command") == 1
 
 
+@pytest.mark.promise("Control", "No sample is missed, and each gets a command")
 def test_no_sample_is_missed_and_each_gets_a_command_of_its_own(graph, loop):
     before = graph.diagnostics(FL)
     received = len(loop.duty)
@@ -234,6 +241,7 @@ def test_the_command_reference_moves_the_arm(loop, start):
     loop.stays(0.2, 0.04, count=50)
 
 
+@pytest.mark.promise("Control", "`step_test` and `step_response` give the same figures for one run")
 def test_step_test_and_a_recording_of_it_give_the_same_figures(loop, start, tmp_path, capsys):
     out, bag, plot = tmp_path / "out", tmp_path / "bag", tmp_path / "plot.svg"
     loop.refer(0.0)
@@ -265,6 +273,7 @@ def test_step_test_and_a_recording_of_it_give_the_same_figures(loop, start, tmp_
     loop.stays(0.0, 0.1, count=100)  # the arm is let down
 
 
+@pytest.mark.promise("Control", "The four laws of the thesis follow references within their ranges")
 @pytest.mark.parametrize("law", [law for law in LAWS if law != FL])
 def test_each_law_starts_by_hand_follows_and_ends_with_duty_0(graph, start, running, law):
     running.controller.stop()
@@ -322,6 +331,7 @@ def by_hand(graph, start, running):
         yield SimpleNamespace(controller=controller, sample=sample, works=works, duty=duty)
 
 
+@pytest.mark.promise("Control", "NaN in a sample gives duty 0 until the next number")
 def test_nan_gives_duty_0_at_once_and_halves_may_come_in_any_order(graph, by_hand):
     by_hand.works(0.1)
     assert by_hand.sample(math.nan) == 0.0
@@ -333,6 +343,7 @@ def test_nan_gives_duty_0_at_once_and_halves_may_come_in_any_order(graph, by_han
     assert by_hand.controller.output.count("NaN") == 1
 
 
+@pytest.mark.promise("Control", "Without samples for 50 ms the duty is 0, and the law starts anew with the next sample")
 def test_silence_gives_duty_0(graph, by_hand):
     by_hand.works(0.1)
     graph.until(lambda: by_hand.duty[-1].data == 0.0, "duty 0")

@@ -33,6 +33,8 @@ def finished(tmp_path_factory):
     return process.returncode, said, complained, out
 
 
+@pytest.mark.promise(
+    "Start", "The demo draws an effect and parameters at random, and its verdict names the hidden effect")
 def test_the_hidden_effect_is_named(finished):
     code, said, complained, out = finished
     assert code == 0, said + complained
@@ -48,6 +50,7 @@ def test_the_hidden_effect_is_named(finished):
                for note in body["notes"]) <= 12
 
 
+@pytest.mark.promise("Start", "`diagnose` sees the recording and the nominal model, and nothing else")
 def test_its_verdict_needs_nothing_but_the_recording(finished, tmp_path):
     shutil.copytree(finished[3] / "recording", tmp_path / "a")
     subprocess.run([sys.executable, "-m", "aeropend_ident.commands.diagnose", "a", "--out", "verdict"], cwd=tmp_path,
@@ -57,6 +60,7 @@ def test_its_verdict_needs_nothing_but_the_recording(finished, tmp_path):
     assert here["which"] == there["which"]
 
 
+@pytest.mark.promise("Augmented model", "The plant runs `augmented.yaml`")
 def test_the_plant_runs_the_augmented_model(finished, start):
     plant = start("plant", "--ros-args", "--params-file", str(finished[3] / "diagnosis" / "augmented.yaml"))
     plant.wait_for("effects: coulomb_friction")
@@ -93,6 +97,8 @@ def test_a_wrong_effect_is_one_line():
     assert len(complained.strip().splitlines()) == 1
 
 
+@pytest.mark.promise(
+    "Start", "The demo draws an effect and parameters at random, and its verdict names the hidden effect")
 def test_the_demo_draws_an_effect_and_numbers_a_little_off():
     nominal = load("bench").model
     drawn = [draw(None, seed) for seed in range(200)]

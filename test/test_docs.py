@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from evaluation import promises
 from scipy.signal import lfilter
 
 from aeropend_control.laws.registry import LAWS
@@ -36,7 +37,6 @@ READMES = [*sorted(ROOT.glob("*.md")), ROOT / "firmware" / "README.md", *sorted(
            *sorted(ROOT.glob("docs/**/*.md"))]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 GUIDE = {path.stem: path.read_text(encoding="utf-8") for path in ROOT.glob("docs/guide/*.md")}
-PROMISES = (ROOT / "docs" / "promises.md").read_text(encoding="utf-8")
 
 TESTS = {name for path in [*ROOT.glob("src/*/test/test_*.py"), *ROOT.glob("test/**/test_*.py")]
          for name in re.findall(r"^ *def (test_\w+)", path.read_text(encoding="utf-8"), re.MULTILINE)}
@@ -102,6 +102,7 @@ FILES = re.compile(r"`((?:src|docs|test|evaluation|firmware|tools)/[\w./-]+)`")
 """A path of the tree in a document."""
 
 
+@pytest.mark.promise("Packages", "Links and files in all documents exist")
 @pytest.mark.parametrize("path", READMES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_files_that_a_document_names_are_there(path):
     named = FILES.findall(path.read_text(encoding="utf-8"))
@@ -146,6 +147,7 @@ def test_links_of_the_readme_lead_somewhere():
     assert len(links(ROOT / "README.md")) > 5
 
 
+@pytest.mark.promise("Packages", "Links and files in all documents exist")
 @pytest.mark.parametrize("path", READMES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_links_lead_somewhere(path):
     for target, section in links(path):
@@ -168,27 +170,28 @@ def test_a_document_names_tests_that_are_there(name):
     assert sorted(TOLD[name] - TESTS) == []
 
 
-def test_the_promises_and_the_page_on_the_network_name_tests():
-    assert min(len(TOLD[name]) for name in ("promises.md", "network.md")) > 20
-    assert "`test_" not in README  # it is for those who use all this
+def test_the_page_of_promises_is_that_of_the_markers():
+    assert promises.PAGE.read_text(encoding="utf-8") == promises.page(), "run python -m evaluation.promises"
 
 
-KEPT = r"`test_|`make |`python |`tools/|not tested: \w|network\.md"
-"""What may stand in the second column of the promises."""
+def test_every_section_has_promises_and_the_readme_names_no_test():
+    assert {promise.section for promise in promises.promises()} == set(promises.SECTIONS)
+    assert "`test_" not in README
 
 
-def test_the_promises_are_tables_that_name_what_keeps_each():
-    for section in PROMISES.split("\n## ")[1:]:
-        title, head, rule, *rows = [line for line in section.splitlines() if line]
-        assert (head, rule) == ("| promise | kept by |", "| --- | --- |"), title
-        kept = [row.rpartition(" | ")[2] for row in rows]
-        assert [one for one in kept if not re.search(KEPT, one)] == []
+@pytest.mark.parametrize("marker", ['"Start"', '"No such section", "It works"', ""])
+def test_a_marker_without_section_and_sentence_is_refused(tmp_path, marker):
+    (tmp_path / "test").mkdir()
+    (tmp_path / "test" / "test_one.py").write_text(f"@pytest.mark.promise({marker})\ndef test_it():\n    pass\n")
+    with pytest.raises(ValueError, match=r"test_one\.py: test_it: give promise"):
+        list(promises.promises(tmp_path))
 
 
 def test_the_readme_is_one_page():
     assert 100 <= len(README.splitlines()) <= 150
 
 
+@pytest.mark.promise("Measurements", "The figures of the README are those of the results")
 def test_figures_of_the_readme_are_those_of_the_results():
     results = (ROOT / "docs" / "results" / "blind.md").read_text(encoding="utf-8")
     measured = [float(number) for number in re.findall(r"\d+(?:\.\d+)?", results)]
@@ -199,6 +202,7 @@ def test_figures_of_the_readme_are_those_of_the_results():
             if float(number) not in [round(one, len(number.partition(".")[2])) for one in measured]] == []
 
 
+@pytest.mark.promise("Packages", "A script of the guide runs")
 def test_a_script_in_the_guide_runs(tmp_path, monkeypatch, capsys):
     """A bag by the name that the script reads."""
     (script,) = re.findall(r"```python\n(.+?)```", GUIDE["python"], re.DOTALL)
@@ -217,6 +221,7 @@ def test_the_readme_has_every_command_at_its_package():
     assert {name: package for package, holds in rows.items() for name in re.findall(r"`(\w+)`", holds)} == entries
 
 
+@pytest.mark.promise("Control", "The four laws of the thesis follow references within their ranges")
 def test_laws_references_and_limits_are_those_of_the_guide():
     told = re.findall(r"^\| `(\w+)` \| (?:PID|the same|speed).*? \| (.+) \|$", GUIDE["control"], re.MULTILINE)
     assert {law for law, _ in told} == LAWS.keys()
@@ -233,6 +238,7 @@ PIECE = re.compile(r"^    from aeropend_.+?(?=\n\n\S|\Z)", re.MULTILINE | re.DOT
 """Lines of Python."""
 
 
+@pytest.mark.promise("Packages", "A script of the guide runs")
 @pytest.mark.parametrize("path", [path for path in READMES if PIECE.search(path.read_text(encoding="utf-8"))],
                          ids=lambda path: str(path.relative_to(ROOT)))
 def test_python_in_a_document_runs(path):
@@ -250,6 +256,7 @@ def test_python_in_a_document_runs(path):
             assert {state: set(equation) for state, equation in found.items()} == {"x": {"x", "u"}, "y": {"y", "u"}}
 
 
+@pytest.mark.promise("Identification", "The equations in the guide are those that the command prints")
 def test_the_equations_that_the_guide_shows_are_those_of_the_simulated_rig():
     true = in_library(load("bench"))
     for state in ("theta_dot", "i_a", "omega"):
@@ -260,6 +267,7 @@ def test_the_equations_that_the_guide_shows_are_those_of_the_simulated_rig():
             assert abs(float(sign + value) - true[state][term]) < 3.0 * float(sigma), term
 
 
+@pytest.mark.promise("Tables", "`import` shows the columns of a file and proposes their meaning")
 def test_import_proposes_what_the_guide_shows(tmp_path, monkeypatch, capsys):
     shown = GUIDE["import"].partition(".venv/bin/import messung.csv\n")[2].partition("\n\nSay")[0]
     angle = np.array([-83.0, -83.0, -82.9, -83.2, 1.4, *[-40.0] * 595])

@@ -67,6 +67,7 @@ def bench() -> Bench:
     return Bench(PROGRAM)
 
 
+@pytest.mark.promise("Hardware", "The board's program runs in an emulated ATmega2560 behind a serial port")
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__.removeprefix("check_"))
 def test_the_program_passes(check: Callable[[Path], object]) -> None:
     check(PROGRAM)
@@ -261,6 +262,7 @@ class TestWithThePlant:
             if k % 1000 == 0:
                 host.forget()
 
+    @pytest.mark.promise("Hardware", "The board's program runs in an emulated ATmega2560 behind a serial port")
     @pytest.mark.parametrize("scheme", [0, 1])
     def test_samples_are_what_the_plant_does(self, scheme: int) -> None:
         board = Board(quiet())
@@ -428,6 +430,7 @@ def wait_for(condition: Callable[[], object], what: str) -> None:
 
 @pytest.mark.live
 class TestProgram:
+    @pytest.mark.promise("Hardware", "The board's program runs in an emulated ATmega2560 behind a serial port")
     def test_is_a_serial_port_that_can_fail(self, tmp_path: Path) -> None:
         link, truth = tmp_path / "port", tmp_path / "truth"
         with emulated_board("--link", str(link), "--truth", str(truth), "--effect", "coulomb_friction") as process:

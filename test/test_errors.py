@@ -24,6 +24,7 @@ def test_every_error_of_the_packages_is_a_user_error():
     assert own_base == {"UserError", *INTERNAL}
 
 
+@pytest.mark.promise("Commands", "An input that cannot be used ends a command with one line and exit code 2")
 def test_a_user_error_is_one_line_and_exit_code_2(capsys):
     @entry_point("my_command")
     def main() -> int:

@@ -160,6 +160,7 @@ BAD = {
 }
 
 
+@pytest.mark.promise("Commands", "An input that cannot be used ends a command with one line and exit code 2")
 def test_bad_parameters_end_in_one_line_and_exit_code_2(start):
     cases = list(BAD.items())
     for at in range(0, len(cases), 3):

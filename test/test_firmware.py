@@ -261,9 +261,11 @@ class TestWiring:
         rows = re.findall(r"^\| ([DA]\d+) \| (P[A-L]\d|ADC\d+)\b", (FIRMWARE / "README.md").read_text(), re.MULTILINE)
         return dict(rows)
 
+    @pytest.mark.promise("Hardware", "The wiring diagram shows the pins that the program uses")
     def test_the_board_s_pins_are_the_chip_s_pins_beside_them(self) -> None:
         assert self.wired() == self.MEGA
 
+    @pytest.mark.promise("Hardware", "The wiring diagram shows the pins that the program uses")
     def test_the_program_uses_the_pins_that_are_wired(self) -> None:
         pins = (FIRMWARE / "pins.h").read_text()
         digital = {board: chip for chip, board in re.findall(r"^#define \w+ (P\w\d)\s+// (D\d+)", pins, re.MULTILINE)}
@@ -294,6 +296,7 @@ class TestBuild:
         finally:
             loader.stop()
 
+    @pytest.mark.promise("Hardware", "Flashing verifies the program on the board")
     def test_flash_writes_the_program_and_reads_it_back(self, tmp_path: Path) -> None:
         loader = BootLoader()
         done = self.flash(loader)
@@ -305,6 +308,7 @@ class TestBuild:
         assert loader.flash == program.ljust(len(loader.flash), b"\xff")
         assert loader.left
 
+    @pytest.mark.promise("Hardware", "Flashing verifies the program on the board")
     def test_a_flash_that_does_not_hold_the_program_is_told(self) -> None:
         done = self.flash(BootLoader(worn=0x123))
         assert done.returncode == 2

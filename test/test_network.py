@@ -134,6 +134,7 @@ def test_where_security_cannot_be_had_no_node_starts(tmp_path):
         assert len(result.stderr.strip().splitlines()) == 1
 
 
+@pytest.mark.promise("Start", "Every `make` target keeps ROS traffic on this machine")
 @pytest.mark.parametrize(("given", "expected"), [(None, "LOCALHOST"), ("SUBNET", "SUBNET")])
 def test_make_keeps_to_this_machine_unless_told_otherwise(given, expected):
     environment = {key: value for key, value in os.environ.items()

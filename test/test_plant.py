@@ -249,6 +249,7 @@ def assert_one_line(process, expected):
     assert expected in line
 
 
+@pytest.mark.promise("Commands", "An input that cannot be used ends a command with one line and exit code 2")
 def test_bad_files_and_arguments_end_in_one_line_and_exit_code_2(start, tmp_path):
     cases = [(write(tmp_path / f"{at}.yaml", body), expected) for at, (body, expected) in enumerate(BAD.items())]
     for name, text, expected in (

@@ -50,6 +50,7 @@ def imports(package: Path) -> set[str]:
     return found - sys.stdlib_module_names - {package.name}
 
 
+@pytest.mark.promise("Packages", "`rosdep` installs what the packages need on ROS 2 Jazzy")
 def test_rosdep_knows_all_that_the_packages_need(tmp_path):
     update = rosdep(tmp_path, "update", "--rosdistro", "jazzy")
     assert update.returncode == 0, update.stderr
@@ -71,6 +72,7 @@ def test_it_would_tell_of_a_key_that_it_does_not_know(tmp_path):
     assert "python3-cereal" in done.stdout + done.stderr
 
 
+@pytest.mark.promise("Packages", "`rosdep` installs what the packages need on ROS 2 Jazzy")
 @pytest.mark.parametrize("package", PACKAGES, ids=lambda path: path.name)
 def test_what_a_package_imports_is_in_its_package_xml(package):
     named = dependencies(package)

@@ -59,6 +59,8 @@ def names(body: dict) -> list[tuple[str, float, bool]]:
              c["probability"], c["found"]) for c in body["which"]["candidates"]]
 
 
+@pytest.mark.promise(
+    "Verdict", "Effects that the recording cannot separate are both named, with the experiment that separates them")
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.truth)
 def test_both_are_named_and_the_experiment_advised_tells_them_apart(case):
     model = case.rig()

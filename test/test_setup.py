@@ -32,6 +32,7 @@ def setup(tmp_path):
     return run
 
 
+@pytest.mark.promise("Start", "`make demo` sets itself up in a clone, and says what it installs and why")
 @pytest.mark.parametrize(("what", "why", "package"), [
     ("compiler", "there is no working C compiler", "gcc"),
     ("firmware", "the board's program and its emulator are built from source", "gcc-avr"),
@@ -44,6 +45,7 @@ def test_what_is_missing_is_installed_and_said(setup, what, why, package):
     assert re.search(rf"^-qq install -y .* {package}\b", asked, re.MULTILINE)
 
 
+@pytest.mark.promise("Start", "`make demo` sets itself up in a clone, and says what it installs and why")
 @pytest.mark.parametrize(("program", "message"), [
     ("sudo", "there is no apt-get here to install gcc libc6-dev: install it and run this again"),
     ("apt-get", "there is no sudo here: run 'apt-get install gcc libc6-dev' as root, then this again")])
@@ -60,6 +62,7 @@ def test_a_python_that_is_not_there_is_named(setup):
     assert "there is no 'python9' here: install Python 3.10 or newer" in said
 
 
+@pytest.mark.promise("Start", "No ROS 2 installation is needed")
 def test_rclpy_is_that_of_the_environment_and_needs_no_ros_install():
     code = "import rclpy; rclpy.init(); print(open('/proc/self/maps').read())"
     clean = {name: os.environ[name] for name in ("PATH", "HOME")}

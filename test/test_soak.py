@@ -48,6 +48,7 @@ def plant(graph, tmp_path_factory):
         yield stand
 
 
+@pytest.mark.promise("Hardware", "Board and bridge behave as specified under faults")
 @pytest.mark.alone
 @pytest.mark.parametrize("name", ALONE)
 def test_what_is_promised_of_a_fault_is_kept(plant, name):

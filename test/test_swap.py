@@ -84,6 +84,7 @@ def shape(message):
     return [shape(item) for item in message]
 
 
+@pytest.mark.promise("Hardware", "The bridge replaces the plant without any other change")
 def test_the_graphs_are_the_same_item_by_item(graph):
     remap = ["--ros-args", "-r", f"__ns:={NAMESPACE}"]
     graphs, joints, armature = {}, {}, {}
@@ -133,6 +134,7 @@ def test_the_firmware_is_back_within_a_second_at_duty_0_and_stops_without_its_ho
     assert 0 < written[stopped] - killed < 0.1e9
 
 
+@pytest.mark.promise("Hardware", "The bridge replaces the plant without any other change")
 @pytest.mark.parametrize("law", LAWS)
 def test_a_law_steps_both_rigs_alike(graph, tmp_path, law):
     found = {}
@@ -144,6 +146,7 @@ def test_a_law_steps_both_rigs_alike(graph, tmp_path, law):
         assert ratios[metric] == pytest.approx(1.0, abs=0.1), metric
 
 
+@pytest.mark.promise("Hardware", "An effect is found through the bridge")
 @pytest.mark.alone
 def test_a_withheld_effect_is_found_from_a_recording_through_the_bridge(tmp_path):
     bag = tmp_path / "bag"

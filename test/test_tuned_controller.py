@@ -46,6 +46,7 @@ def test_the_rig_does_what_the_augmented_model_predicts(cases, effect):
     assert measured.e_ss == pytest.approx(predicted.e_ss, abs=0.003)
 
 
+@pytest.mark.promise("Augmented model", "A controller tuned on it meets its requirements on the rig")
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_the_controller_tuned_on_it_meets_what_it_was_tuned_for(cases, effect):
     measured = cases[effect].measured_after
@@ -66,6 +67,7 @@ def test_the_table_shows_every_case(cases):
     assert table(list(cases.values())).row_count == 2 * len(EFFECTS)
 
 
+@pytest.mark.promise("Augmented model", "The plant runs `augmented.yaml`")
 def test_the_plant_node_runs_the_augmented_model_to_the_last_bit(graph, start, tmp_path):
     file = tmp_path / "augmented.yaml"
     save(made("coulomb_friction").augmented, file)

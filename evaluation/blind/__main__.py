@@ -3,7 +3,7 @@
 
     make blind                            312 recordings of 70 s: about an hour on two cores, 2.5 GB
     make blind ARGS="--count 60 --seed 7"
-    make blind ARGS="--unknown --count 120"      rigs whose numbers nobody knows
+    make blind ARGS="--uncalibrated --count 120" uncalibrated rigs
 
 Steps can be run alone: --steps make,diagnose,peers,score. The labels stay sealed until every verdict is written.
 """
@@ -145,7 +145,7 @@ def opened(out: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
     return json.loads(zlib.decompress((out / SEALED).read_bytes())), verdicts
 
 
-def _of_unknown_rigs(options: argparse.Namespace, steps: list[str]) -> None:
+def _uncalibrated_rigs(options: argparse.Namespace, steps: list[str]) -> None:
     out = options.out / "unknown"
     if "make" in steps:
         shutil.rmtree(out, ignore_errors=True)
@@ -167,12 +167,12 @@ def main() -> None:
     parser.add_argument("--steps", default="make,diagnose,peers,score")
     parser.add_argument("--bic-every", type=int, default=4, help="ask stepwise BIC for one recording in so many")
     parser.add_argument("--only", nargs="*", default=[], help="diagnose only these recordings")
-    parser.add_argument("--unknown", action="store_true",
-                        help="rigs whose numbers nobody knows: angle and command alone, and free decays")
+    parser.add_argument("--uncalibrated", "--unknown", action="store_true",
+                        help="uncalibrated rigs: angle and command alone, and free decays")
     options = parser.parse_args()
     steps = options.steps.split(",")
-    if options.unknown:
-        _of_unknown_rigs(options, steps)
+    if options.uncalibrated:
+        _uncalibrated_rigs(options, steps)
         return
     if "make" in steps:
         shutil.rmtree(options.out, ignore_errors=True)

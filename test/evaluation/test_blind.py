@@ -39,10 +39,12 @@ def test_every_recording_got_a_verdict(checked):
     assert not [v["error"] for v in verdicts.values() if "error" in v]
 
 
+@pytest.mark.promise("Measurements", "Few blind recordings reach the figures of the README")
 def test_the_right_effect_comes_first(pairs):
     assert np.mean([score.right_first(*pair) for pair in score.of_kind(pairs, "single")]) >= 0.75
 
 
+@pytest.mark.promise("Verdict", "Parameters within 5 % are refitted and count as no effect")
 def test_no_effect_is_claimed_where_there_is_none(pairs):
     assert sum(answer.claims for _, answer in score.of_kind(pairs, "none")) <= 1
 
@@ -54,6 +56,7 @@ def test_what_is_outside_the_catalogue_is_placed_and_not_always_claimed(pairs):
     assert any(answer.first == "unknown" for _, answer in outside)
 
 
+@pytest.mark.promise("Measurements", "The blind check opens the labels after the last verdict")
 def test_labels_open_only_after_the_last_verdict(checked):
     out, labels, _ = checked
     content = (out / check.SEALED).read_bytes()

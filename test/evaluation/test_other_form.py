@@ -25,6 +25,7 @@ def test_a_lag_is_placed_by_what_curves_at_its_place_explain(effect, place, seed
     assert body["where"]["place"] == place
 
 
+@pytest.mark.promise("Measurements", "The plant of the blind check shares no code with the simulated rig")
 def test_the_plant_of_the_blind_check_shares_nothing_with_ours():
     imported = set()
     for node in ast.walk(ast.parse(Path(plant.__file__).read_text(encoding="utf-8"))):

@@ -9,6 +9,7 @@ from aeropend_ident.testing import rigs
 PLAIN = {"brush_drop": {"v_brush": 0.15}, "supply_sag": {"r_supply": 0.3}, "cable_torque": {"k": 6.0, "theta0": 0.3}}
 
 
+@pytest.mark.promise("Measurements", "The peers of the benchmarks work")
 @pytest.mark.parametrize("effect", PLAIN)
 def test_sparse_regression_finds_a_plain_effect(effect: str) -> None:
     said = peers.sparse_regression(rigs.recorded(5, {effect: PLAIN[effect]}))
@@ -29,6 +30,7 @@ def test_a_rig_as_its_model_gives_none() -> None:
         assert {k: said[k] for k in none} == none
 
 
+@pytest.mark.promise("Measurements", "The peers of the benchmarks work")
 def test_stepwise_bic_finds_a_plain_effect_and_keeps_its_time() -> None:
     signals = rigs.recorded(5, {"quadratic_drag": {"k": 1.0}}, duration=20.0)
     said = peers.stepwise_bic(signals)

@@ -147,6 +147,7 @@ def slow(v: dict[str, dict]) -> None:
         body["seconds"] = 10.5
 
 
+@pytest.mark.promise("Measurements", "Each figure of the blind check can fail")
 @pytest.mark.parametrize(("spoil", "missed"), [
     (wrong_first, "right effect first"),
     (one_effect_wrong, "right effect first (worst)"),

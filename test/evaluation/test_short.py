@@ -10,6 +10,7 @@ from aeropend_ident.testing.rigs import BENCH
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
 
+@pytest.mark.promise("Verdict", "A random torque is found by its statistics as `gust`")
 @pytest.mark.parametrize(("effect", "form", "seed", "verdict"), [
     ("gust", "table", 201, "gust"), ("gust", "other", 202, "gust"), ("gust", "table", 203, "gust"),
     ("own_wake", "table", 201, "unknown"), ("own_wake", "table", 202, "unknown")])

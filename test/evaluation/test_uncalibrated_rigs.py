@@ -27,6 +27,7 @@ def checked(tmp_path_factory):
     return out
 
 
+@pytest.mark.promise("Measurements", "Few blind recordings reach the figures of the README")
 def test_figures_hold_on_a_few(checked):
     figures = {f.name: f for f in uncalibrated.report(checked)}
     assert figures["free decays: what brakes told rightly"].value == 1.0
@@ -42,6 +43,7 @@ def test_every_recording_got_a_verdict(checked):
     assert not [v["error"] for v in verdicts if "error" in v]
 
 
+@pytest.mark.promise("Measurements", "The blind check opens the labels after the last verdict")
 def test_labels_open_only_after_the_last_verdict(checked):
     last = sorted((checked / "verdicts").iterdir())[-1]
     last.rename(checked / "away")

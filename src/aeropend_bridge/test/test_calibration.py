@@ -46,6 +46,7 @@ def test_the_angle_goes_on_over_the_wrap_of_the_encoder():
     assert theta[20] == pytest.approx(0.0, abs=1e-12)
 
 
+@pytest.mark.promise("Hardware", "An angle with an error is not measured")
 def test_an_angle_that_came_with_an_error_is_not_measured():
     c = default()
     assert math.isnan(c.measured(REST._replace(flags=Flag.SSI | Flag.SSI_PARITY)).theta)
@@ -133,6 +134,7 @@ def test_an_encoder_that_is_not_wired_both_ways_keeps_that_zero_and_says_so():
     assert note.startswith("ssi_zero")
 
 
+@pytest.mark.promise("Hardware", "`calibrate` measures the zeros of a rig at rest, and refuses others")
 @pytest.mark.parametrize(
     ("wrong", "expected"),
     [

@@ -46,6 +46,7 @@ def errors(clock, frames):
     return np.array(out), np.array(stamps)
 
 
+@pytest.mark.promise("Hardware", "Stamps are the sampling instants, whatever delays a frame")
 @pytest.mark.parametrize("drift", [0.0, 3e-3, -5e-3])
 @pytest.mark.parametrize("ticks", [0, 2**32 - 10_000_000])
 def test_stamps_are_the_sampling_instants(drift, ticks):
@@ -65,6 +66,7 @@ def test_a_clock_that_warms_up_is_followed():
     assert np.sqrt(np.mean(error[490 * 5 :] ** 2)) < 100e3
 
 
+@pytest.mark.promise("Hardware", "Stamps are the sampling instants, whatever delays a frame")
 def test_no_number_of_late_frames_moves_it():
     def late(rng):
         return 0.0 if rng.random() < 0.4 else rng.uniform(0.5e6, 3e6)
@@ -74,6 +76,7 @@ def test_no_number_of_late_frames_moves_it():
     assert np.abs(error[490 * 5 :]).max() < 20e3
 
 
+@pytest.mark.promise("Hardware", "Stamps are the sampling instants, whatever delays a frame")
 def test_stalls_of_the_host_do_not_move_it():
     rig = Rig(np.random.default_rng(4), 2e-4)
     frames = list(rig.frames(490 * 30))

@@ -55,6 +55,7 @@ def test_the_speed_is_held_though_the_model_does_not_name_the_effect(effect):
     assert step.overshoot < 0.1
 
 
+@pytest.mark.promise("Augmented model", "A controller that gets it compensates the effects in it")
 @pytest.mark.parametrize("effect", ["bridge_drop", "brush_drop", "rotor_friction", "command_delay"])
 def test_an_effect_that_the_model_names_is_compensated(effect):
     step, _ = answer(Cascade(with_effect(effect)), with_effect(effect), 100.0)
@@ -68,6 +69,7 @@ def test_the_arm_behind_the_cascade_bears_what_the_model_does_not_name(effect):
     assert np.ptp(run.truth["theta"][-500:]) < 0.01
 
 
+@pytest.mark.promise("Augmented model", "A controller that gets it compensates the effects in it")
 @pytest.mark.parametrize("effect", ["command_delay", "thrust_lag", "encoder_lag", "axial_inflow", "coulomb_friction"])
 def test_the_arm_behind_the_cascade_is_compensated(effect):
     model = with_effect(effect)

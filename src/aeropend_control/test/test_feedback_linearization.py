@@ -38,6 +38,7 @@ def test_the_thesis_gains_give_the_checked_response():
     assert abs(step.steady_state_error) < 1e-4
 
 
+@pytest.mark.promise("Control", "`tune` meets its requirements, and prints margins")
 @pytest.mark.parametrize(("model", "t_s", "M_p"), [(BENCH, 1.5, 0.1), (BENCH, 1.2, 0.05), (THESIS, 1.5, 0.2)])
 def test_a_tuned_loop_meets_what_it_was_tuned_for(model, t_s, M_p):
     for step in answers(FeedbackLinearization(model, tune(model, t_s, M_p)), model):
@@ -46,6 +47,7 @@ def test_a_tuned_loop_meets_what_it_was_tuned_for(model, t_s, M_p):
         assert abs(step.steady_state_error) < 2e-3
 
 
+@pytest.mark.promise("Augmented model", "A controller that gets it compensates the effects in it")
 @pytest.mark.parametrize("effect", FORESEEN)
 def test_an_effect_that_the_model_names_is_compensated(effect):
     """With the effect known, the loop is as good as the nominal one."""

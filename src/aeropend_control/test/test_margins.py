@@ -22,6 +22,7 @@ def test_margins_of_a_loop_that_is_known():
     assert m.delay == pytest.approx(m.phase / m.crossover, rel=0.01)
 
 
+@pytest.mark.promise("Control", "`tune` meets its requirements, and prints margins")
 def test_the_delay_margin_is_where_the_loop_becomes_unstable():
     found = margins(BENCH, "feedback_linearization")
     assert found.gain > 2.0

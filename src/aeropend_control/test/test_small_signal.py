@@ -42,6 +42,7 @@ def test_the_schedule_keeps_the_answer_the_same_far_away():
     assert abs(overshoot[True]) < 0.5 * abs(overshoot[False])
 
 
+@pytest.mark.promise("Augmented model", "A controller that gets it compensates the effects in it")
 @pytest.mark.parametrize("effect", ["command_delay", "thrust_lag", "axial_inflow", "coulomb_friction", "cable_torque",
                                     "angle_offset", "encoder_lag"])
 def test_an_effect_that_the_model_names_is_compensated(effect):

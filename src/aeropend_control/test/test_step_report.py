@@ -35,6 +35,7 @@ def test_a_good_step_keeps_every_limit(law):
     assert step_report.missed(fast, step_report.limits(law)) == []
 
 
+@pytest.mark.promise("Control", "The requirements of Table 6.1 are met on `bench`, and what is missed is named")
 @pytest.mark.parametrize(("name", "value"), [
     ("rise_time", 0.51), ("rise_time", math.nan), ("peak_time", 0.91), ("settling_time", 3.7),
     ("settling_time", math.nan), ("overshoot", 0.21), ("steady_state_error", 0.0088), ("steady_state_error", -0.0088),

@@ -125,6 +125,7 @@ def test_it_goes_on_from_the_duty_that_the_rig_held_meanwhile(loop):
     assert loop.law.since == 0.2
 
 
+@pytest.mark.promise("Control", "Without samples for 50 ms the duty is 0, and the law starts anew with the next sample")
 def test_silence_means_duty_0_and_a_new_start(loop):
     loop.samples(5)
     loop.supervisor.on_timeout()

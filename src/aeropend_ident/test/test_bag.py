@@ -137,6 +137,7 @@ def same(recording, made, count=None):
         np.testing.assert_array_equal(getattr(recording, name), made.arrays[name][:count], err_msg=name)
 
 
+@pytest.mark.promise("Recordings", "Bags of `ros2 bag record` are read, MCAP and SQLite3, compressed and split")
 @pytest.mark.parametrize("version", range(1, 10))
 def test_sqlite_of_every_version(bags, tmp_path, version):
     made = bags.content()
@@ -147,6 +148,7 @@ def test_sqlite_of_every_version(bags, tmp_path, version):
     assert recording.complete
 
 
+@pytest.mark.promise("Recordings", "Bags of `ros2 bag record` are read, MCAP and SQLite3, compressed and split")
 @pytest.mark.parametrize("version", [5, 6, 9])
 @pytest.mark.parametrize(
     "options",
@@ -169,6 +171,7 @@ def test_mcap_of_every_kind(bags, tmp_path, version, options):
     assert connection.ext.offered_qos_profiles[0].reliability.name == "RELIABLE"
 
 
+@pytest.mark.promise("Recordings", "Bags of `ros2 bag record` are read, MCAP and SQLite3, compressed and split")
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE, CompressionMode.STORAGE])
 def test_compressed(bags, tmp_path, storage, mode):
@@ -190,6 +193,7 @@ def test_unknown_compression_is_said(bags, tmp_path):
         read(tmp_path)
 
 
+@pytest.mark.promise("Recordings", "Bags of `ros2 bag record` are read, MCAP and SQLite3, compressed and split")
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_split_bags_are_one(bags, tmp_path, storage):
     made = bags.content(60)

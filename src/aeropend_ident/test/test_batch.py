@@ -85,6 +85,7 @@ def summary(out):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.promise("Verdict", "`--each` gives each rig its verdict; processes, Dask and threads do not change it")
 def test_every_rig_gets_its_verdict_and_what_cannot_be_used_its_reason(alone, recordings):
     out, result = alone
     assert result.stderr == ""
@@ -112,12 +113,14 @@ def test_every_rig_gets_its_verdict_and_what_cannot_be_used_its_reason(alone, re
     assert table[-1].startswith("3 of 5 diagnosed")
 
 
+@pytest.mark.promise("Verdict", "`--each` gives each rig its verdict; processes, Dask and threads do not change it")
 def test_processes_find_the_same_to_the_last_bit(alone, recordings, tmp_path):
     result = run("--each", *recordings, "--out", tmp_path / "out", "--jobs", 2)
     assert (result.returncode, result.stderr) == (0, "")
     assert verdicts(tmp_path / "out") == verdicts(alone[0])
 
 
+@pytest.mark.promise("Verdict", "`--each` gives each rig its verdict; processes, Dask and threads do not change it")
 def test_a_dask_cluster_finds_the_same_to_the_last_bit(alone, recordings, cluster, tmp_path):
     result = run("--each", *recordings, "--out", tmp_path / "out", "--dask", cluster.scheduler_address)
     assert (result.returncode, result.stderr) == (0, "")

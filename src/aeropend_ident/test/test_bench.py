@@ -14,6 +14,7 @@ from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import Model, load
 
 
+@pytest.mark.promise("Identification", "`bench_test` gives parameters from tables and recordings, with their source")
 @pytest.mark.parametrize("seed", range(3))
 def test_the_stairs_of_a_recording_give_the_numbers_of_its_rig(seed):
     rng = np.random.default_rng(seed)
@@ -40,6 +41,7 @@ def write(path, text):
     return str(path)
 
 
+@pytest.mark.promise("Identification", "`bench_test` gives parameters from tables and recordings, with their source")
 def test_the_command_writes_a_model_that_says_where_its_numbers_come_from(tmp_path, capsys):
     pairs = write(tmp_path / "pairs.csv", "v_a [V];i_a [mA]\n0,48;440\n1,42;1300\n0,89;850\n# a comment\n2,44;2280\n")
     speeds = write(tmp_path / "speeds.csv", "omega [rpm],v_a [V],i_a [A]\n1158,1.08,0.29\n1402,1.377,0.4\n1638,1.666,"

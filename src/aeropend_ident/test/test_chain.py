@@ -30,6 +30,7 @@ def test_the_training_part_alone_has_the_same_residuals(chains, stage):
         np.testing.assert_array_equal(r, head[channel])
 
 
+@pytest.mark.promise("Verdict", "A large recording does not need more memory for the search of free curves")
 def test_a_head_is_as_long_as_asked_for(chains):
     train = chains.each[0].signals.train
     assert [len(c.signals) for c in chains.head(train + 100).each] == [train, 100]

@@ -30,6 +30,8 @@ def off(true, stamps, **options):
 RATES = st.sampled_from([20.0, 49.0, 120.0, 490.196, 1000.0])
 
 
+@pytest.mark.promise(
+    "Tables", "Time stamps that are late, rounded, repeated or out of order are repaired, and the repairs are listed")
 @given(rate=RATES, resolution=st.sampled_from([1e-6, 1e-3, 0.01, 0.046]), seed=st.integers(0, 99))
 @settings(max_examples=25, deadline=None, derandomize=True)
 def test_stamps_that_are_rounded_or_of_polls(rate, resolution, seed):
@@ -47,6 +49,8 @@ def test_stamps_of_arrival_that_are_late_by_chance(rate, late, seed):
     assert off(true, np.maximum.accumulate(true + delays))[0] < 0.2 / rate
 
 
+@pytest.mark.promise(
+    "Tables", "Time stamps that are late, rounded, repeated or out of order are repaired, and the repairs are listed")
 @given(rate=RATES, rows=st.integers(2, 32), apart=st.sampled_from([0.0, 1e-4]))
 @settings(max_examples=25, deadline=None, derandomize=True)
 def test_rows_that_come_in_bursts(rate, rows, apart):
@@ -68,6 +72,7 @@ def test_bursts_that_are_true_are_kept():
     np.testing.assert_allclose(np.diff(found.time), found.period, rtol=1e-6)
 
 
+@pytest.mark.promise("Tables", "No reading is invented: rows that are lost leave gaps")
 def test_rows_that_are_irregular_are_kept_where_they_are():
     true = np.cumsum(np.random.default_rng(1).uniform(0.6, 1.4, 800)) / 50.0
     error, found = off(true, true)
@@ -87,6 +92,7 @@ def test_a_serial_line_that_sets_the_pace():
     assert off(true, stamps, clock="even")[0] > 0.015
 
 
+@pytest.mark.promise("Tables", "No reading is invented: rows that are lost leave gaps")
 @given(rate=RATES, seed=st.integers(0, 99), resolution=st.sampled_from([0.0, 1e-3]))
 @settings(max_examples=25, deadline=None, derandomize=True)
 def test_rows_that_are_lost_leave_gaps(rate, seed, resolution):
@@ -120,6 +126,8 @@ def test_clocks_that_start_anew(stamps, options):
     assert "starts anew once" in found.notes[0]
 
 
+@pytest.mark.promise(
+    "Tables", "Time stamps that are late, rounded, repeated or out of order are repaired, and the repairs are listed")
 def test_rows_out_of_order_and_repeated():
     true = np.arange(500) / 50.0
     order = np.arange(500)
@@ -148,6 +156,8 @@ def test_rows_without_a_time_are_told():
     assert "1 row without a time left out" in found.notes
 
 
+@pytest.mark.promise(
+    "Tables", "Time stamps that are late, rounded, repeated or out of order are repaired, and the repairs are listed")
 @pytest.mark.parametrize(("stamps", "options", "says"), [
     (lambda t: np.where(t > 5.0, t - 5.0, t), {}, "time goes back from 5 s to 0.02 s (a restart"),
     (lambda t: t * 0.0, {}, "the same time"),

@@ -33,6 +33,7 @@ def bag(bags, tmp_path_factory):
     return bags.write(tmp_path_factory.mktemp("made") / "my_bag", made)
 
 
+@pytest.mark.promise("Verdict", "Gaps are measured in free runs on held-out data that no fit has used")
 def test_a_bag_gives_a_verdict(bag, tmp_path):
     out = tmp_path / "verdict"
     result = run(bag, "--out", out)
@@ -103,6 +104,7 @@ def test_a_broken_bag_is_read_or_refused_in_one_line(bag, tmp_path):
     assert "broken" in refused(broken, "--out", tmp_path / "out")
 
 
+@pytest.mark.promise("Commands", "`--help` of each command shows examples and exit codes")
 def test_help_shows_examples_and_exit_codes():
     result = run("--help")
     assert result.returncode == 0
@@ -174,6 +176,8 @@ def test_what_one_recording_says_is_shown_on_others(tmp_path, bags):
     assert alone["which"] == body["which"]
 
 
+@pytest.mark.promise(
+    "Verdict", "Effects that the recording cannot separate are both named, with the experiment that separates them")
 def test_the_advised_experiment_can_be_pasted_into_a_shell():
     advice = NextExperiment("w", {"kind": "steps", "duration": 60.0, "sequence": (0.1, 0.5)})
     words = shlex.split(experiment(advice).removesuffix(" (w)"))

@@ -23,6 +23,7 @@ def candidate(body, effect):
     return next(c for c in body["which"]["candidates"] if c["effect"] == effect)
 
 
+@pytest.mark.promise("Verdict", "Every effect of the catalogue is named, with its place")
 @pytest.mark.parametrize("effect", CATALOGUE)
 def test_each_effect_is_named_placed_and_measured(effect):
     body = diagnose(BENCH, [recorded(list(CATALOGUE).index(effect) + 50, {effect: {}})], 2).body
@@ -38,6 +39,7 @@ def test_each_effect_is_named_placed_and_measured(effect):
     json.dumps(body, allow_nan=False)
 
 
+@pytest.mark.promise("Verdict", "Parameters within 5 % are refitted and count as no effect")
 @pytest.mark.parametrize("seed", range(4))
 def test_a_rig_whose_numbers_are_merely_a_little_off_has_no_effect(seed):
     body = diagnose(BENCH, [recorded(seed)], 2).body
@@ -45,6 +47,7 @@ def test_a_rig_whose_numbers_are_merely_a_little_off_has_no_effect(seed):
     assert body["shrink"]["gap_after"] < 1.2 * body["shrink"]["floor"]
 
 
+@pytest.mark.promise("Verdict", "Several effects are found; the one with the largest share of the gap comes first")
 def test_two_effects_in_different_places_are_both_found():
     body = diagnose(BENCH, [recorded(71, {"coulomb_friction": {}, "brush_drop": {}})], 2).body
     assert set(body["which"]["effects"]) == {"coulomb_friction", "brush_drop"}
@@ -60,6 +63,7 @@ def test_an_effect_whose_search_may_end_in_a_false_valley_is_begun_elsewhere():
         assert found["low"] < true < found["high"], name
 
 
+@pytest.mark.promise("Augmented model", "Friction and a thrust exponent are found to a part in a thousand")
 def test_friction_and_a_curve_of_thrust_are_found_to_a_part_in_a_thousand():
     effects = {"coulomb_friction": {"accel": 1.0}, "thrust_exponent": {"n": 2.15}}
     duty = Excitation(duration=60.0).series()
@@ -70,6 +74,7 @@ def test_friction_and_a_curve_of_thrust_are_found_to_a_part_in_a_thousand():
     assert candidate(body, "thrust_exponent")["parameters"]["n"]["value"] == pytest.approx(2.15, abs=2e-3)
 
 
+@pytest.mark.promise("Verdict", "Several effects are found; the one with the largest share of the gap comes first")
 @pytest.mark.parametrize(("friction", "drop", "first"), [(4.0, 0.05, "coulomb_friction"), (0.2, 0.8, "brush_drop")])
 def test_the_effect_that_opens_more_of_the_gap_comes_first(friction, drop, first):
     effects = {"coulomb_friction": {"accel": friction}, "brush_drop": {"v_brush": drop}}
@@ -78,6 +83,7 @@ def test_the_effect_that_opens_more_of_the_gap_comes_first(friction, drop, first
     assert body["which"]["verdict"] == body["which"]["effects"][0] == first
 
 
+@pytest.mark.promise("Verdict", "Several effects are found; the one with the largest share of the gap comes first")
 def test_two_effects_in_one_place_are_both_found():
     body = diagnose(BENCH, [recorded(72, {"coulomb_friction": {}, "thrust_lag": {}})], 2).body
     assert set(body["which"]["effects"]) == {"coulomb_friction", "thrust_lag"}
@@ -101,6 +107,7 @@ def far_off(number, factor):
     return made
 
 
+@pytest.mark.promise("Verdict", "A parameter that is far off is named as `parameter_mismatch`")
 @pytest.mark.parametrize(("number", "factor"), [
     ("R_a", 1.4), ("mgd_over_J", 1.4), ("J_m", 1.4), ("R_a", 0.8), ("mgd_over_J", 0.845)])
 def test_a_number_that_is_far_off_is_named(number, factor):
@@ -129,6 +136,7 @@ def test_what_the_catalogue_does_not_hold_is_unknown():
     assert body["which"]["effects"] == []  # no random torque moves the arm in jumps
 
 
+@pytest.mark.promise("Verdict", "Channels that were not measured leave a verdict on the others")
 @pytest.mark.parametrize("without", [("omega",), ("i_a", "v_a"), ("omega", "i_a", "v_a")])
 def test_missing_channels_leave_a_verdict_on_the_arm(without):
     body = diagnose(BENCH, [recorded(95, {"coulomb_friction": {"accel": 1.5}}, off=0.005, without=without)], 2).body
@@ -136,6 +144,7 @@ def test_missing_channels_leave_a_verdict_on_the_arm(without):
     assert "coulomb_friction" in body["which"]["effects"]
 
 
+@pytest.mark.promise("Verdict", "Several recordings of one rig are fitted together")
 def test_several_recordings_of_one_rig_are_fitted_together():
     effects = {"coulomb_friction": {}}
     model = drawn_rig(97, effects)
@@ -173,6 +182,7 @@ def test_a_motor_that_rests_all_along_is_no_reason_to_fail():
     assert diagnose(BENCH, [signals]).body["which"]["verdict"] == "none"
 
 
+@pytest.mark.promise("Verdict", "Gaps are measured in free runs on held-out data that no fit has used")
 def test_what_is_held_out_moves_no_fit():
     duty = steps(30.0, 77)
     columns, _ = rig.record(drawn_rig(77, {"coulomb_friction": {}}), duty, 77)

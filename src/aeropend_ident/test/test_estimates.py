@@ -12,6 +12,7 @@ from aeropend_ident.studies.thesis import TABLE_4_1, TABLE_4_2
 from aeropend_sim.model.excitation import Excitation
 
 
+@pytest.mark.promise("Identification", "The tables of the thesis are recomputed beside the printed values")
 def test_table_4_1_gives_the_resistance_the_thesis_prints():
     found = estimates.blocked_rotor(TABLE_4_1).numbers["R_a"]
     assert f"{found.value:.2f} {found.scatter:.2f}" == "1.08 0.04"

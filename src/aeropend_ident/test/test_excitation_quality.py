@@ -11,6 +11,7 @@ from aeropend_sim.model.parameters import load
 BENCH = load("bench")
 
 
+@pytest.mark.promise("Identification", "`excitation_quality` finds terms that an input does not excite")
 def test_a_rich_input_excites_every_term():
     rich = quality(BENCH, planned(BENCH, Excitation(duration=20.0).series()))
     assert {(e.equation, e.term) for e in rich} == {
@@ -19,6 +20,7 @@ def test_a_rich_input_excites_every_term():
     assert not any(e.poor for e in rich)
 
 
+@pytest.mark.promise("Identification", "`excitation_quality` finds terms that an input does not excite")
 def test_a_single_step_leaves_terms_undetermined(capsys):
     assert main(["--kind", "hold", "--duration", "10"]) == 0
     said = capsys.readouterr().out

@@ -12,6 +12,7 @@ def measured(model, seed=21, effects=None):
     return gap(free_run(model, signals), signals, start, stop), floor(signals, start, stop)
 
 
+@pytest.mark.promise("Verdict", "The floor is what a perfect model leaves")
 def test_the_true_model_runs_down_to_the_floor():
     found, floors = measured(drawn_rig(21, {}))
     for channel in ("theta", "i_a", "v_a"):
@@ -21,6 +22,7 @@ def test_the_true_model_runs_down_to_the_floor():
         np.sqrt(np.mean([(found.rms[c] / found.spread[c]) ** 2 for c in found.rms])))
 
 
+@pytest.mark.promise("Verdict", "The share of the gap that is closed has an interval")
 def test_share_of_what_can_close():
     effects = {"coulomb_friction": {}}
     before, floors = measured(BENCH, effects=effects)

@@ -35,6 +35,8 @@ def test_what_must_be_added_to_a_wrong_model_is_found():
         assert found["theta_dot"]["omega*omega"] == pytest.approx(0.0785, rel=1e-3)
 
 
+@pytest.mark.promise(
+    "Identification", "`identify` finds the equations of the simulated rig through its measurement chain")
 @pytest.mark.parametrize("method", ["weak", "sindy"])
 def test_noisy_data_give_the_true_terms_and_honest_sigmas(method):
     x, v = simulated(25.0, 3)
@@ -53,6 +55,7 @@ def test_what_is_no_sum_of_the_terms_is_noted(cubic):
     assert any(line.startswith("note: the free run misses") for line in lines(found)) == bool(cubic)
 
 
+@pytest.mark.promise("Identification", "Nothing is fitted to held-out data")
 def test_nothing_is_fitted_to_what_is_held_out():
     x, u = pushed(lambda x: -2.0 * x)
     late = np.arange(len(x)) >= 0.75 * len(x)

@@ -48,6 +48,8 @@ def identified(bag, tmp_path_factory):
     return result.stdout, out
 
 
+@pytest.mark.promise(
+    "Identification", "`identify` finds the equations of the simulated rig through its measurement chain")
 def test_the_equations_of_a_rig_are_found_through_its_measurement_chain(identified):
     said, out = identified
     assert said.startswith("d(theta)/dt = 1 theta_dot\nd(theta_dot)/dt = ")
@@ -101,6 +103,7 @@ def test_a_bag_with_a_gap_is_refused(bags, tmp_path):
     assert "missing" in refused(gap, "--out", tmp_path / "out")
 
 
+@pytest.mark.promise("Identification", "It uses no parameter of the model file but the measurement chain")
 def test_the_model_file_is_asked_for_the_measurement_chain_alone(bag, identified, tmp_path):
     numbers, effects = {n: 1.3 * x for n, x in BENCH.model.items()}, {"coulomb_friction": {"accel": 0.8}}
     other = Model("other", numbers, BENCH.sensing, effects)

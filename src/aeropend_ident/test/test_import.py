@@ -28,6 +28,7 @@ def proposed(capsys, path):
     return shlex.split(command)[1:], out
 
 
+@pytest.mark.promise("Tables", "`import` shows the columns of a file and proposes their meaning")
 @pytest.mark.parametrize("head", [
     "t [s],theta [deg],pwm [%]", "Zeit / s,Winkel / °,Tastgrad / %", "tiempo,ángulo,ciclo", "temps (s),angle (°),pwm",
     "время,угол,ШИМ", "时间,角度,占空比", "time_s,angle_deg,duty_pct",
@@ -53,6 +54,7 @@ def test_a_proposal_for_columns_without_names(tmp_path, capsys):
     assert proposed(capsys, put(tmp_path, text))[0][2:] == ["--time", "1", "--theta", "2:deg"]
 
 
+@pytest.mark.promise("Tables", "`import` shows the columns of a file and proposes their meaning")
 @pytest.mark.parametrize(("text", "says"), [
     ("t,angle 1,angle 2\n" + lines(TIME, ANGLE, ANGLE), "perhaps --theta 'angle 2:deg' (one of 2 such columns)"),
     ("t,angle\n" + lines(TIME, ANGLE / 57.3), "rad or deg?"),
@@ -131,6 +133,7 @@ def test_encode_is_the_inverse_of_decode(bags):
     assert block.names["name"] == ("arm", "rotor")
 
 
+@pytest.mark.promise("Tables", "A table leads to a verdict")
 def test_from_a_german_table_to_a_verdict(tmp_path):
     """A rig of 98 Hz, its CSV as Excel writes it in Germany, up to the report."""
     duty = Excitation(duration=20.0, seed=3).series()

@@ -51,6 +51,7 @@ def wait_for(processes, path, recorder, number):
         time.sleep(0.05)
 
 
+@pytest.mark.promise("Recordings", "A recording that was killed loses at most the last second, and opens as it is")
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("wait", [0.0, 0.17, 0.31])
 def test_kill_9_loses_at_most_the_last_second(processes, plant, storage, wait):
@@ -79,6 +80,7 @@ def test_kill_9_loses_at_most_the_last_second(processes, plant, storage, wait):
     assert {file.name: file.read_bytes() for file in path.iterdir()} == there
 
 
+@pytest.mark.promise("Recordings", "A recording that was killed loses at most the last second, and opens as it is")
 def test_the_bag_opens_at_any_moment(processes, plant):
     """Copies taken while it is written, as a kill or a reader would find it."""
     path = processes.folder / "bag"

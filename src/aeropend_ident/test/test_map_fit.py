@@ -33,6 +33,7 @@ def test_white_noise_counts_in_full_and_coloured_noise_by_its_correlation_time()
     assert effective_sample_size(coloured) == pytest.approx(200_000 * 0.05 / 1.95, rel=0.2)
 
 
+@pytest.mark.promise("Verdict", "Estimates lie within their 95 % intervals")
 def test_estimates_lie_within_their_intervals():
     inside = 0
     for seed in range(200):

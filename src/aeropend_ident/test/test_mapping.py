@@ -10,6 +10,7 @@ from arm_tables import ANGLE, DUTY, MAPPED, NUMBERS, TIME, imported, lines, put,
 from aeropend_ident.tables.units import parse
 
 
+@pytest.mark.promise("Tables", "Units, signs, zeros and counts are converted")
 @pytest.mark.parametrize(("quantity", "unit", "of_one"), [
     ("theta", "deg", math.radians(1.0)), ("theta", "rad", 1.0), ("theta", "turn", 2 * math.pi),
     ("theta", "°", math.radians(1.0)), ("theta", "Grad", math.radians(1.0)), ("theta", "54deg", math.radians(54.0)),
@@ -23,6 +24,7 @@ def test_units(quantity, unit, of_one):
     assert parse(quantity, unit).size == pytest.approx(of_one)
 
 
+@pytest.mark.promise("Tables", "Units, signs, zeros and counts are converted")
 def test_every_quantity_arrives_in_si(tmp_path):
     text = "t [ms],Winkel,pwm,n,I,U,soll\n" + lines(1e3 * TIME, ANGLE, 255 * DUTY / 100, 900 + ANGLE, 10 * ANGLE,
                                                     ANGLE, 0 * TIME + 20, form="{:.9f}")
@@ -47,6 +49,7 @@ def test_pulses_of_a_servo(tmp_path):
     np.testing.assert_allclose(recording.duty, DUTY / 100, atol=1e-7)
 
 
+@pytest.mark.promise("Tables", "Units, signs, zeros and counts are converted")
 @pytest.mark.parametrize("zero", ["-83deg", "-83", "-1.44862328rad", "end"])
 def test_zero_is_what_is_read_when_the_arm_hangs(tmp_path, zero):
     x = np.where(TIME < 2.5, ANGLE, 0.0)
@@ -54,6 +57,7 @@ def test_zero_is_what_is_read_when_the_arm_hangs(tmp_path, zero):
     np.testing.assert_allclose(recording.theta, np.radians(x), atol=1e-4)
 
 
+@pytest.mark.promise("Tables", "Units, signs, zeros and counts are converted")
 def test_flipped_counts(tmp_path):
     x = 512 - np.rint(ANGLE / 360 * 1024)
     recording = imported(tmp_path, put(tmp_path, lines(TIME, x, form="{:.2f}")), "--time", "1:s", "--theta",

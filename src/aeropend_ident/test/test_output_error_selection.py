@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 import numpy as np
+import pytest
 from sparse_data import TERMS, pushed_once
 
 from aeropend_ident.commands.identify import document, lines
@@ -9,6 +10,7 @@ from aeropend_ident.identification.identify import identify
 from aeropend_ident.identification.output_error_selection import QuadraticMisfit
 
 
+@pytest.mark.promise("Identification", "A term that the data do not determine is marked `undetermined`")
 def test_a_term_that_hangs_on_one_stretch_of_the_recording_is_undetermined():
     data = pushed_once(0.5)
     found = identify(data, "weak", TERMS)
@@ -36,6 +38,7 @@ def test_a_choice_that_the_free_run_does_not_keep_is_taken_back(monkeypatch):
     assert set(identify(pushed_once(0.02), "weak", TERMS).equations["x"]) == {"x", "u"}
 
 
+@pytest.mark.promise("Identification", "A term that the data do not determine is marked `undetermined`")
 def test_a_term_that_the_data_cannot_tell_from_another_is_said_to_be_undetermined():
     t = np.arange(4000) * 0.005
     u = np.repeat(np.random.default_rng(5).uniform(-1.0, 1.0, 40), 100)

@@ -15,6 +15,7 @@ HALF = 0.5 * SAMPLE_PERIOD
 EARLY = {"command_delay": {"delay": -HALF}}
 
 
+@pytest.mark.promise("Hardware", "A phase-correct PWM is recognised, and is no gap")
 @pytest.mark.parametrize("seed", [1, 2])
 def test_an_early_duty_is_told_from_the_recording(seed):
     result = diagnose(BENCH, [recorded(seed, EARLY)], 1)

@@ -191,6 +191,7 @@ def test_what_is_lost_is_said_of_each_topic():
     assert losses({"armature": 4}, 3) == "4 lost (armature 4), 3 of them in the first second of a publisher"
 
 
+@pytest.mark.promise("Recordings", "`record` and `replay` reproduce the data")
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_record_replay_record_gives_the_same_data(processes, storage):
     count = 2000
@@ -309,6 +310,7 @@ def commands(bags, values, step_ns=200_000_000, topic="/duty_command"):
 PLANT = ("/armature", "sensor_msgs/msg/BatteryState")
 
 
+@pytest.mark.promise("Recordings", "A recorded duty drives the plant again")
 def test_a_recorded_duty_drives_the_plant_and_leaves_it_at_rest(bags, processes):
     bags.write(processes.folder / "commands", commands(bags, [0.25, 0.5, 0.125, 0.375], 500_000_000))
     plant = processes.start(module="aeropend_sim.nodes.plant")

@@ -30,6 +30,7 @@ def broken(bags, tmp_path):
     return path, made
 
 
+@pytest.mark.promise("Recordings", "`recover` makes a whole bag of a broken one")
 def test_a_broken_bag_becomes_a_proper_one(broken, tmp_path, capsys):
     path, made = broken
     before = contents(path)

@@ -90,6 +90,7 @@ def test_a_channel_that_is_gone_for_three_seconds_changes_nothing(channel, effec
     assert_same(verdict(columns), effect)
 
 
+@pytest.mark.promise("Verdict", "Channels that were not measured leave a verdict on the others")
 @pytest.mark.parametrize(("missing", "effect"), [
     (("v_a",), "none"), (("omega", "i_a", "v_a"), "none"), (("omega",), "coulomb_friction"),
     (("i_a",), "coulomb_friction"), (("omega", "i_a", "v_a"), "coulomb_friction")])
@@ -97,6 +98,7 @@ def test_a_channel_that_was_not_measured_changes_nothing_for_the_arm(missing, ef
     assert_same(verdict(recorded(effect, **without(missing))), effect)
 
 
+@pytest.mark.promise("Verdict", "An effect upstream is not blamed on a stage downstream")
 @pytest.mark.parametrize(("missing", "effect"), [
     (("v_a",), "brush_drop"), (("omega", "i_a", "v_a"), "brush_drop"),
     (("i_a",), "supply_sag"), (("omega", "i_a", "v_a"), "supply_sag")])
@@ -211,6 +213,8 @@ def test_the_order_of_messages_and_the_time_of_day_do_not_matter(run):
         assert run(shifted) == (0, plain, "")
 
 
+@pytest.mark.promise(
+    "Recordings", "Lost samples, saturated or constant readings, and pauses are noted, and do not change the verdict")
 def test_stamps_that_jitter_and_lost_messages_change_nothing(run):
     bag = Bag()
     rng = np.random.default_rng(0)
@@ -224,6 +228,8 @@ def test_stamps_that_jitter_and_lost_messages_change_nothing(run):
     assert any("missing" in note for note in body["notes"])
 
 
+@pytest.mark.promise(
+    "Recordings", "Lost samples, saturated or constant readings, and pauses are noted, and do not change the verdict")
 @pytest.mark.parametrize("pause", [600.0, 365.0 * 86400.0])
 def test_after_a_pause_only_the_longest_piece_counts(run, pause):
     bag = Bag(duration=11.0)
@@ -283,6 +289,7 @@ def _at_rest(bag, duty):
     bag.columns = {name: x[-n:] for name, x in columns.items()} | {"duty": np.full(n, duty)}
 
 
+@pytest.mark.promise("Recordings", "A recording whose stamps keep no period is refused in one line")
 @pytest.mark.parametrize(("spoil", "words"), [
     (_one_second, "1.0 s of samples"), (_set_back, "fit no sample period"), (_no_duty, "no duty"),
     (_no_angle, "no arm angle"), (_nan_angle, "no arm angle"), (_nan_duty, "no duty"), (_motor_off, "nothing happens"),

@@ -326,6 +326,7 @@ def test_regions_are_marked_where_the_misfit_is_drawn(several, nominal):
         assert "Misfit" not in rendered(nominal)
 
 
+@pytest.mark.promise("Verdict", "The report says when to read it with care")
 def test_reasons_for_care(friction, angle_only):
     def care(diagnosis, **which):
         page = Page(rendered(diagnosis, **which))
@@ -353,6 +354,7 @@ def test_reasons_for_care(friction, angle_only):
     assert "Only 60 % of the gap closes" in care(replace(friction, conclusions=open_))
 
 
+@pytest.mark.promise("Verdict", "The report says when to read it with care")
 def test_a_good_recording_needs_no_care(friction):
     long = replace(friction.signals[0], period=4.0 * SAMPLE_PERIOD)
     assert "with care" not in rendered(replace(friction, signals=[long]))

@@ -134,6 +134,8 @@ def bent_current(columns, truth):
     columns["i_a"] = columns["i_a"] + 0.1 * np.sin(6.0 * truth["i_a"])
 
 
+@pytest.mark.promise(
+    "Verdict", "An effect outside the catalogue is `unknown`, with its likeliest place and free curves")
 def test_what_the_catalogue_does_not_hold_is_unknown_with_its_place_and_its_curves():
     body = diagnose(BENCH, [recording({}, 5, 20.0, bent_current)], 2).body
     which = body["which"]

@@ -102,12 +102,16 @@ def test_nothing_happening_is_no_ground_for_a_verdict():
         from_arrays(still, SAMPLE_PERIOD, BENCH.sensing)
 
 
+@pytest.mark.promise(
+    "Recordings", "Lost samples, saturated or constant readings, and pauses are noted, and do not change the verdict")
 def test_a_channel_that_never_changes_is_left_out_and_said():
     signals = from_arrays(columns(i_a=np.full(2941, 0.3)), SAMPLE_PERIOD, BENCH.sensing)
     assert not signals.has("i_a")
     assert any("i_a is 0.3 A all the time" in note for note in signals.notes)
 
 
+@pytest.mark.promise(
+    "Recordings", "Lost samples, saturated or constant readings, and pauses are noted, and do not change the verdict")
 @pytest.mark.parametrize(("channel", "limit"), [("theta", 0.3), ("i_a", 0.4), ("v_a", 1.0)])
 def test_readings_at_the_end_of_a_range_are_left_out_and_said(channel, limit):
     data = columns(20.0)

@@ -8,6 +8,7 @@ import zlib
 
 import h5py
 import numpy as np
+import pytest
 import scipy.io
 from arm_tables import ANGLE, DUTY, MAPPED, TIME, comma, imported, lines, refused, table_rows, workbook
 from hypothesis import given, settings
@@ -17,6 +18,7 @@ from aeropend_ident.tables import files
 from aeropend_ident.tables.table import TableError
 
 
+@pytest.mark.promise("Tables", "`import` reads CSV, text, Excel, MATLAB and NumPy")
 def test_a_workbook(tmp_path):
     head = [["Versuch 3"], [], ["Zeit", "Winkel", "PWM"], ["s", "°", "%"]]
     path = workbook(tmp_path / "run.xlsx", table_rows(*head), more=[("Notes", [["nothing", "here"]])])
@@ -72,6 +74,7 @@ def test_what_would_fill_the_memory_is_refused(tmp_path, capsys):
     assert "more than 1000" in refused(capsys, tmp_path / "wide.csv", tmp_path / "b", "--time", "1:s")
 
 
+@pytest.mark.promise("Tables", "`import` reads CSV, text, Excel, MATLAB and NumPy")
 def test_matlab_files(tmp_path, capsys):
     scipy.io.savemat(tmp_path / "run.mat", {"t": TIME, "log": {"angle": ANGLE[:, None], "note": "hello"}, "k": 3.0,
                                             "both": np.stack((TIME, ANGLE)), "short": TIME[:50]})
@@ -91,6 +94,7 @@ def test_matlab_files(tmp_path, capsys):
     np.testing.assert_allclose(recording.theta, np.radians(ANGLE))
 
 
+@pytest.mark.promise("Tables", "`import` reads CSV, text, Excel, MATLAB and NumPy")
 def test_numpy_files(tmp_path, capsys):
     np.save(tmp_path / "a.npy", np.stack((TIME, ANGLE), axis=1))
     np.savez(tmp_path / "b.npz", t=TIME, x=ANGLE.astype(np.float32), name=np.array("rig"))

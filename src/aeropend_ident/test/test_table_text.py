@@ -41,6 +41,7 @@ DIALECTS = {
 }
 
 
+@pytest.mark.promise("Tables", "`import` reads CSV, text, Excel, MATLAB and NumPy")
 @pytest.mark.parametrize("name", DIALECTS)
 def test_dialects(tmp_path, name):
     text, encoding = DIALECTS[name]
@@ -91,6 +92,7 @@ UNREADABLE = {
 }
 
 
+@pytest.mark.promise("Tables", "A cell that is not a number is refused with line and column")
 @pytest.mark.parametrize("text", UNREADABLE, ids=range(len(UNREADABLE)))
 def test_what_cannot_be_read_is_said_in_one_line(tmp_path, capsys, text):
     said = refused(capsys, put(tmp_path, text), tmp_path / "bag", *MAPPED)
@@ -98,6 +100,7 @@ def test_what_cannot_be_read_is_said_in_one_line(tmp_path, capsys, text):
     assert not (tmp_path / "bag").exists()
 
 
+@pytest.mark.promise("Tables", "A cell that is not a number is refused with line and column")
 def test_rows_that_cannot_be_read_are_left_out_on_demand(tmp_path, capsys):
     text = "t,x\n" + NUMBERS.replace("0.2000,", "0.2000,?!", 1).replace("0.4000,", "0.4000,1,", 1)
     recording = imported(tmp_path, put(tmp_path, text), *MAPPED, "--skip-bad")

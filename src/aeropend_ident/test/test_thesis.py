@@ -3,9 +3,12 @@
 
 
 
+import pytest
+
 from aeropend_ident.studies import thesis
 
 
+@pytest.mark.promise("Identification", "The tables of the thesis are recomputed beside the printed values")
 def test_chapter_4_is_printed_beside_what_comes_out(capsys):
     assert thesis.main(["4"]) == 0
     said = capsys.readouterr().out

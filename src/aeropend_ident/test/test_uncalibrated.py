@@ -68,6 +68,7 @@ def candidate(body, effect):
     return next(c for c in body["which"]["candidates"] if c["effect"] == effect)
 
 
+@pytest.mark.promise("Uncalibrated rigs", "Resolution and noise are estimated from the recording")
 def test_resolution_is_the_step_between_values():
     x = np.random.default_rng(0).standard_normal(500)
     assert resolution(np.round(x / 0.0175) * 0.0175) == pytest.approx(0.0175, rel=1e-6)
@@ -75,6 +76,7 @@ def test_resolution_is_the_step_between_values():
     assert resolution(np.round(np.round(x / 0.05678) * 0.05678, 5)) == pytest.approx(0.05678, rel=1e-3)
 
 
+@pytest.mark.promise("Uncalibrated rigs", "Resolution and noise are estimated from the recording")
 @pytest.mark.parametrize("rate", [20.0, 490.0])
 def test_noise_is_told_from_motion(rate):
     t = np.arange(0.0, 20.0, 1.0 / rate)
@@ -104,6 +106,7 @@ def test_a_push_begins_a_new_swinging():
     assert max(swings, key=lambda s: s.stop).size == pytest.approx(1.6, abs=0.2)
 
 
+@pytest.mark.promise("Uncalibrated rigs", "A free decay gives gravity, damping, hanging angle and the kind of friction")
 def test_a_viscous_swing_lacks_nothing_and_tells_its_numbers():
     body = verdict(from_uncalibrated(recording(*let_go(9.0, zero=0.1)), BENCH.sensing))
     assert (body["which"]["verdict"], body["which"]["effects"]) == ("none", [])
@@ -116,6 +119,7 @@ def test_a_viscous_swing_lacks_nothing_and_tells_its_numbers():
     json.dumps(body, allow_nan=False)
 
 
+@pytest.mark.promise("Uncalibrated rigs", "A free decay gives gravity, damping, hanging angle and the kind of friction")
 @pytest.mark.parametrize(("effect", "parameters"), [("coulomb_friction", {"accel": 1.0}),
                                                     ("quadratic_drag", {"k": 0.15})])
 @pytest.mark.parametrize("seed", [1, 2])
@@ -129,6 +133,7 @@ def test_what_brakes_a_swing_is_named_at_20_hz_and_one_degree(effect, parameters
     assert body["shrink"]["closed"] > 0.8
 
 
+@pytest.mark.promise("Uncalibrated rigs", "Irregular stamps and a clock that wanders are no effect")
 def test_stamps_in_bursts_do():
     t, theta = let_go(8.0, {"coulomb_friction": {"accel": 1.0}}, rate=200.0, lsb=1e-3)
     kept = np.arange(len(t)) % 34 < 8
@@ -137,6 +142,7 @@ def test_stamps_in_bursts_do():
     assert body["which"]["verdict"] == "coulomb_friction"
 
 
+@pytest.mark.promise("Uncalibrated rigs", "Irregular stamps and a clock that wanders are no effect")
 @pytest.mark.parametrize("wander", [0.012, 0.02])
 def test_a_clock_that_wanders_is_no_effect(wander):
     t, theta = let_go(14.0, {"coulomb_friction": {"accel": 0.9}}, gravity=56.0, damping=0.13, first=1.3, rate=50.0,
@@ -164,6 +170,8 @@ def test_a_narrow_band_is_worth_few_samples():
     assert effective_sample_size(ring, power=2) == pytest.approx(4000 / 25, rel=0.4)
 
 
+@pytest.mark.promise(
+    "Uncalibrated rigs", "Gravity, damping, zero and lever are each recording's own, with their run-to-run spread")
 def test_runs_that_differ_are_no_effect_and_their_spread_is_told():
     runs = [let_go(8.0, gravity=g, damping=c, first=a, seed=k)
             for k, (g, c, a) in enumerate([(40.0, 0.4, 1.0), (42.0, 0.5, 0.8), (39.0, 0.45, 1.2)])]
@@ -174,6 +182,8 @@ def test_runs_that_differ_are_no_effect_and_their_spread_is_told():
     assert gravity["run_to_run"] == pytest.approx(1.53, rel=0.1)
 
 
+@pytest.mark.promise(
+    "Uncalibrated rigs", "Gravity, damping, zero and lever are each recording's own, with their run-to-run spread")
 def test_where_it_hangs_is_each_runs_own():
     runs = [let_go(8.0, first=1.0, zero=zero, seed=k) for k, zero in enumerate((0.0, 0.1, -0.05))]
     body = verdict(*(from_uncalibrated(recording(*run), BENCH.sensing) for run in runs))
@@ -183,6 +193,7 @@ def test_where_it_hangs_is_each_runs_own():
     assert hangs["run_to_run"] == pytest.approx(0.076, rel=0.1)
 
 
+@pytest.mark.promise("Uncalibrated rigs", "An angle that thrust holds is refused without its command")
 def test_an_arm_that_thrust_holds_cannot_be_diagnosed_without_the_command():
     parts = [let_go(4.0, first=a, held=0.2, damping=1.5)[1] for a in (0.6, 0.7, 0.5)]
     theta = np.concatenate(parts) + math.radians(100.0)
@@ -205,11 +216,14 @@ def unknown(seed, effects=None, duration=30.0, factor=0.5, lever=1.0, **kept):
     return model, recording(t, columns["theta"], duty, **{c: columns[c] for c in kept})
 
 
+@pytest.mark.promise(
+    "Uncalibrated rigs", "Gravity, damping, zero and lever are each recording's own, with their run-to-run spread")
 def test_the_lever_is_each_runs_own():
     read = [unknown(4, duration=15.0, lever=lever)[1] for lever in (1.0, 1.2, 0.9)]
     assert verdict(*(from_uncalibrated(r, BENCH.sensing) for r in read))["which"]["verdict"] == "none"
 
 
+@pytest.mark.promise("Uncalibrated rigs", "Angle and command show an effect beside the identified nominal model")
 def test_angle_and_command_alone_name_an_effect_in_an_uncalibrated_rig():
     model, read = unknown(3, {"coulomb_friction": {"accel": 0.8}})
     body = verdict(from_uncalibrated(read, BENCH.sensing))
@@ -259,6 +273,7 @@ def test_thrifty_chains_give_what_others_give_and_count():
     assert cached.runs == len(tried)
 
 
+@pytest.mark.promise("Uncalibrated rigs", "A search that was cut short says so")
 def test_a_search_that_is_cut_short_says_so(monkeypatch):
     _, read = unknown(3, {"coulomb_friction": {"accel": 0.8}}, duration=20.0)
     signals = from_uncalibrated(read, BENCH.sensing)
@@ -268,6 +283,7 @@ def test_a_search_that_is_cut_short_says_so(monkeypatch):
     json.dumps(result.body, allow_nan=False)
 
 
+@pytest.mark.promise("Uncalibrated rigs", "A lag or curve that the nominal model can absorb is not claimed")
 @pytest.mark.parametrize(("effect", "size"), [("thrust_lag", {"tau": 0.01}), ("thrust_exponent", {"n": 1.97}),
                                               ("command_delay", {"delay": 0.004})])
 def test_what_the_nominal_model_can_take_is_not_claimed(effect, size):
@@ -275,6 +291,7 @@ def test_what_the_nominal_model_can_take_is_not_claimed(effect, size):
     assert verdict(from_uncalibrated(read, BENCH.sensing))["which"]["effects"] == []
 
 
+@pytest.mark.promise("Uncalibrated rigs", "The advised experiment does not exceed the duty that the rig has had")
 def test_the_experiment_advised_asks_for_no_more_duty_than_there_was():
     _, read = unknown(6, {"cable_torque": {}})
     advised = verdict(from_uncalibrated(read, BENCH.sensing))["which"]["next_experiment"]["excite"]
@@ -287,6 +304,8 @@ def test_an_experiment_drives_an_unknown_rig_no_harder_than_it_was_driven(top):
         assert 0.0 < experiment.series().max() <= max(top, 0.02)
 
 
+@pytest.mark.promise(
+    "Uncalibrated rigs", "All channels give every parameter that they determine; the others are marked")
 def test_all_channels_give_the_numbers_of_an_uncalibrated_rig():
     model, read = unknown(4, omega=True, i_a=True, v_a=True)
     body = verdict(from_uncalibrated(read, BENCH.sensing))
@@ -298,6 +317,7 @@ def test_all_channels_give_the_numbers_of_an_uncalibrated_rig():
     assert not body["which"]["numbers"]["K_t"]["determined"]  # only K_t over J_m shows
 
 
+@pytest.mark.promise("Uncalibrated rigs", "All channels show the effects of the catalogue")
 @pytest.mark.parametrize("effect", ["brush_drop", "coulomb_friction"])
 def test_all_channels_show_effects_on_top(effect):
     _, read = unknown(4, {effect: {}}, duration=20.0, omega=True, i_a=True, v_a=True)

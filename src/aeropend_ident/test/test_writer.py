@@ -94,6 +94,7 @@ def test_ends_as_rosbags_would_end_it(bags, tmp_path, storage):
     assert found(tmp_path / "a" / "bag") == found(tmp_path / "b" / "bag")
 
 
+@pytest.mark.promise("Views", "Drawing and bags are read by the libraries of RViz and Foxglove")
 def test_foxglove_s_own_reader_decodes_every_message_by_the_schemas_in_the_file(bags, tmp_path):
     made = bags.content(10)
     writer = BagWriter(tmp_path / "bag")

@@ -12,6 +12,7 @@ def parser():
     return parser
 
 
+@pytest.mark.promise("Commands", "Commands leave out the arguments that ROS adds")
 def test_what_ros_passes_on_is_left_out(parser):
     assert vars(parser.parse_args(["my_bag", "--ros-args", "-r", "__ns:=/rig"])) == {"bag": "my_bag", "rate": None}
 

@@ -43,6 +43,7 @@ def panels(node):
     return [node] if isinstance(node, str) else panels(node["first"]) + panels(node["second"])
 
 
+@pytest.mark.promise("Views", "The layouts for Foxglove and PlotJuggler show what the rig measures")
 def test_foxglove_plots_what_the_rig_measures():
     layout = json.loads(LAYOUTS.joinpath("foxglove.json").read_text(encoding="utf-8"))
     assert sorted(panels(layout["layout"])) == sorted(layout["configById"])
@@ -67,6 +68,7 @@ def test_foxglove_talks_to_the_rig_by_its_names():
     assert configs["3D!rig"]["followTf"] in {link.get("name") for link in urdf.iter("link")}
 
 
+@pytest.mark.promise("Views", "The layouts for Foxglove and PlotJuggler show what the rig measures")
 def test_plotjuggler_plots_what_the_rig_measures():
     root = ET.fromstring(LAYOUTS.joinpath("plotjuggler.xml").read_text(encoding="utf-8"))
     values = [in_plotjuggler(curve.get("name")) for curve in root.iter("curve")]

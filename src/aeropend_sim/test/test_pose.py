@@ -37,6 +37,7 @@ def placed(theta, rotor=0.0):
     return links
 
 
+@pytest.mark.promise("Views", "The 3D model moves as the rig does")
 def test_joints_are_named_as_in_joint_states():
     assert tuple(JOINTS) == interface.JOINTS
     assert not any(numbers(joint, "origin", "rpy").any() for joint in JOINTS.values())  # `placed` relies on it
@@ -49,6 +50,7 @@ def test_joints_are_named_as_in_joint_states():
     assert {material.get("name") for material in ROBOT.iter("material")} == named
 
 
+@pytest.mark.promise("Views", "Drawing and bags are read by the libraries of RViz and Foxglove")
 def test_the_parser_of_rviz_and_robot_state_publisher_takes_the_drawing():
     """check_urdf is urdfdom, which both read a drawing with."""
     done = subprocess.run(["check_urdf", str(URDF)], capture_output=True, text=True, check=False)
@@ -57,6 +59,7 @@ def test_the_parser_of_rviz_and_robot_state_publisher_takes_the_drawing():
     assert not re.search("warning|error", done.stdout + done.stderr, re.IGNORECASE)
 
 
+@pytest.mark.promise("Views", "The 3D model moves as the rig does")
 def test_the_arm_hangs_at_0_and_is_level_in_front_at_a_quarter_turn():
     pivot = placed(0.0)["rod"][1]
     end = numbers(JOINTS["rotor"], "origin")[2]
