@@ -25,7 +25,8 @@ MEASURED = (
     ("The figures on uncalibrated rigs", 'make blind ARGS="--uncalibrated"', "docs/results/uncalibrated.md"),
     ("Speed, memory and growth beside peers", "make bench", "docs/results/bench.md"),
     ("Behaviour under load and faults for half an hour", "make soak", "docs/results/soak.md"),
-    ("Step responses of the four laws in the whole graph", "python -m evaluation.control_graph", "docs/results/control.md"),
+    ("Step responses of the four laws in the whole graph", "python -m evaluation.control_graph",
+     "docs/results/control.md"),
     ("The packages build with colcon, and every command starts where `ros2 run` finds it", "tools/colcon-check", ""),
 )
 """Promises that only a measurement or a build can show: promise, command, page of the results."""
