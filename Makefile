@@ -22,7 +22,7 @@ endif
 .PHONY: help demo test bench blind sensitivity soak coverage lint clean distclean
 
 help: ## show this
-	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile | expand -t 18
+	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile | expand -t 20
 
 demo: .venv/.runtime ## run a plant with a hidden effect and name it (EFFECT=coulomb_friction pins one, ARGS="--help")
 	$(BIN)/demo $(if $(EFFECT),--effect $(EFFECT)) $(ARGS)

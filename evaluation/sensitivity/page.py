@@ -47,10 +47,6 @@ NOTES = (
     """)
 """What the table does not say itself."""
 
-MANY = 2
-"""Changed verdicts at one factor from which the page names a threshold among those that verdicts depend on."""
-
-
 @dataclass(frozen=True)
 class Outcome:
     """What one change of a threshold does.
@@ -136,19 +132,20 @@ def _summary(varied: Sequence[Threshold], both: Mapping[str, tuple[Outcome, ...]
     def most(t: Threshold) -> int:
         return max(len(o.changed) for o in both[t.id])
 
-    same = sum(most(t) == 0 for t in varied)
-    fall = sum(any(o.right < o.base for o in both[t.id]) for t in varied)
-    strong = sorted((t for t in varied if most(t) >= MANY), key=most, reverse=True)
-    text = (f"Of {len(varied)} thresholds, {same} change no verdict at ±30 %, and {len(varied) - same} change at "
-            f"least one; with {fall} of them, fewer verdicts are right. ")
+    strong = sorted((t for t in varied if most(t)), key=most, reverse=True)
+    fall = sum(any(o.right < o.base for o in both[t.id]) for t in strong)
+    same = len(varied) - len(strong)
+    text = f"Of {len(varied)} thresholds that act on these recordings, {same} change no verdict at ±30 %."
     if not strong:
-        return text + f"None changes {MANY} verdicts or more."
+        return text
     named = "; ".join(f"`{t.id}` ({_changes(both[t.id])})" for t in strong)
-    return text + f"These change {MANY} verdicts or more, the strongest first: {named}."
+    return (f"{text} The other {len(strong)} change one or more, and {fall} of them make fewer verdicts right. The "
+            f"strongest first: {named}.")
 
 
 def _changes(outcomes: Sequence[Outcome]) -> str:
-    return ", ".join(f"{len(o.changed)} at ×{f:g}" for f, o in zip(FACTORS, outcomes, strict=True))
+    low, high = outcomes
+    return f"×0.7 changes {len(low.changed) or 'none'}, ×1.3 {len(high.changed) or 'none'}"
 
 
 def _row(t: Threshold, outcomes: Sequence[Outcome]) -> str:

@@ -24,7 +24,7 @@ from aeropend_ident.diagnosis import policy
 PACKAGES = ("aeropend_ident.signals", "aeropend_ident.estimation", "aeropend_ident.diagnosis")
 """Packages whose modules hold thresholds."""
 
-ORIGINS = ("derived", "measured", "convention", "choice")
+ORIGINS = ("derived", "convention", "choice", "measured")
 """Words that name the origin of a threshold: after an opening parenthesis, or at the begin of a sentence."""
 
 LEFT_OUT = ("(format)", "(layout)", "(memory)")

@@ -23,15 +23,21 @@ from aeropend_ident.signals.noise import reading_noise_at
 from aeropend_ident.signals.signals import CHANNELS, STILL, Signals, from_arrays
 
 FEWEST = 30
-"""Samples of an uncalibrated rig below which there is no verdict (choice)."""
+"""Samples of an uncalibrated rig below which there is no verdict (choice).
+
+Measured: at ±30 % no verdict of 5 recordings changes (docs/results/thresholds.md)."""
 
 LONGEST_PERIOD = 5e-3
 """[s] Longest period of the grid on which a command acts; the angle may be read at a lower rate.
 
-Choice: a command that is late by half of it moves the arm by less than a reading's noise."""
+Choice: a command that is late by half of it moves the arm by less than a reading's noise.
+
+Measured: at ±30 % no verdict of 5 recordings changes (docs/results/thresholds.md)."""
 
 MOVES = 3.0
-"""Standard deviations of a reading that a channel must vary by to show that the motor runs (choice)."""
+"""Standard deviations of a reading that a channel must vary by to show that the motor runs (choice).
+
+Measured: at ±30 % no verdict of 5 recordings changes (docs/results/thresholds.md)."""
 
 
 def signals_of(bag: str | Path, namespace: str | None, sensing: Mapping[str, float], held_out: float = 0.3, *,

@@ -45,13 +45,19 @@ HORIZONS = (0.15, 0.35, 1.0)
 """Parts of the training data over which a fit is made one after the other (choice)."""
 
 SHORTEST_HORIZON = 3.0
-"""[s] Shortest horizon: some swings of the arm (choice)."""
+"""[s] Shortest horizon: some swings of the arm (choice).
+
+Measured: at ±30 % no verdict of 5 recordings changes (docs/results/thresholds.md)."""
 
 ROUNDS = 4
-"""Rounds of the fits over each horizon; the last fit of a search has more (choice)."""
+"""Rounds of the fits over each horizon; the last fit of a search has more (choice).
+
+Measured: at ±30 % no verdict of 5 recordings changes (docs/results/thresholds.md)."""
 
 COARSE = 0.01
-"""[s] Sample period of the data that a search starts with (choice: far below the arm's time constants)."""
+"""[s] Sample period of the data that a search starts with (choice: far below the arm's time constants).
+
+Measured: at ±30 % no verdict of 3 recordings changes (docs/results/thresholds.md)."""
 
 TEST_FUNCTIONS = (0.25, 0.5)
 """[s] Half-widths of the test functions of the weak form: a quarter and a half of a usual period of the arm."""
@@ -72,7 +78,9 @@ Choice: longer than any winding's L_a/R_a."""
 
 SCATTER, MINIMUM_FREEDOM = 1.3, 30
 """Ratio of the scatter around a smooth swing to a reading's noise above which it counts as the noise, and the degrees
-of freedom needed (choice)."""
+of freedom needed (choice).
+
+Measured: at ±30 % no verdict of 2 recordings changes (docs/results/thresholds.md)."""
 
 SIZES = {"command_delay.delay": (0.01, 0.03, 0.09), "thrust_lag.tau": (0.03, 0.1, 0.3),
          "thrust_exponent.n": (1.3, 1.65, 2.35, 2.7)}
@@ -82,15 +90,21 @@ FOLLOWED = 2
 """Number of these sizes from which a search is made (choice)."""
 
 HANGS = 0.1
-"""[rad] An arm that starts nearer to hanging than this is taken to start with a rotor that stands (choice)."""
+"""[rad] An arm that starts nearer to hanging than this is taken to start with a rotor that stands (choice).
+
+Measured: at ±30 % no verdict of 3 recordings changes (docs/results/thresholds.md)."""
 
 CURVE = 11
-"""Points of the static curve from duty to lift that is reported (choice)."""
+"""Points of the static curve from duty to lift that is reported (choice).
+
+Measured: at ±30 % no verdict of 3 recordings changes (docs/results/thresholds.md)."""
 
 FULL = 2.3
 """[V] Voltage at full duty of a rig without a measured voltage.
 
-Choice: only its product with other parameters acts."""
+Choice: only its product with other parameters acts.
+
+Measured: at ±30 % no verdict of 3 recordings changes (docs/results/thresholds.md)."""
 
 
 def fit_nominal_model(model: Model, recordings: Sequence[Signals]) -> tuple[Model, list[Signals]]:
