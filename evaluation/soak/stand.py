@@ -21,7 +21,7 @@ from std_srvs.srv import SetBool
 
 from aeropend_control.nodes import wire
 from aeropend_ident.bags import recording
-from aeropend_ident.bags.bag import Bag
+from aeropend_ident.bags.container import Bag
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 from aeropend_sim.ros import interface
 from evaluation.soak.ear import Ear

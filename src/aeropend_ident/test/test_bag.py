@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
-from aeropend_ident.bags.bag import Bag, RecordingError
+from aeropend_ident.bags.container import Bag
+from aeropend_ident.bags.reading import RecordingError
 from aeropend_ident.bags.recording import CHANNELS, read
 
 QOS = """- history: 3

@@ -22,9 +22,9 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefiniti
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
 from aeropend_control.analysis import step_report
-from aeropend_ident.bags.bag import RecordingError
 from aeropend_ident.bags.cdr import LONGEST, decode
 from aeropend_ident.bags.msgtypes import message_class
+from aeropend_ident.bags.reading import RecordingError
 from aeropend_ident.bags.recording import read
 from aeropend_ident.commands import recover
 from aeropend_ident.commands.diagnose import print_table
@@ -334,7 +334,7 @@ ZEROS = 1 << 31
 BOMB = """
 import resource, sys
 from pathlib import Path
-from aeropend_ident.bags.bag import RecordingError
+from aeropend_ident.bags.reading import RecordingError
 from aeropend_ident.bags.recording import read
 resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import Reader
 
-from aeropend_ident.bags.bag import Bag
+from aeropend_ident.bags.container import Bag
 from aeropend_ident.bags.recording import read
 from aeropend_ident.commands.recover import recover
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import Reader
 
-from aeropend_ident.bags.bag import Bag
+from aeropend_ident.bags.container import Bag
 from aeropend_ident.bags.recording import read
 from aeropend_ident.nodes.record import Tap, losses
 from aeropend_ident.nodes.replay import Plan

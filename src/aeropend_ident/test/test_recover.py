@@ -6,7 +6,7 @@ import pytest
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from aeropend_ident.bags.bag import Bag
+from aeropend_ident.bags.container import Bag
 from aeropend_ident.bags.recording import read
 from aeropend_ident.commands.recover import main, recover
 

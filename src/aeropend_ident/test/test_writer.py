@@ -13,7 +13,7 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.rosbag2.errors import WriterError
 
-from aeropend_ident.bags.bag import Bag
+from aeropend_ident.bags.container import Bag
 from aeropend_ident.bags.recording import read
 from aeropend_ident.bags.writer import BagWriter
 
@@ -180,7 +180,7 @@ def test_killed_in_the_middle_of_a_checkpoint(bags, tmp_path, stop):
 FILL = """
 import resource, sys
 from pathlib import Path
-from aeropend_ident.bags.bag import Bag
+from aeropend_ident.bags.container import Bag
 from aeropend_ident.bags.writer import BagWriter
 from rosbags.typesys import Stores, get_typestore
 store = get_typestore(Stores.ROS2_JAZZY)

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.bags.bag import Bag, RecordingError
 from aeropend_ident.bags.cdr import Block, decode
+from aeropend_ident.bags.container import Bag
+from aeropend_ident.bags.reading import RecordingError
 
 __all__ = ["CHANNELS", "Recording", "RecordingError", "Truth", "holds", "read", "split_topic"]
 

@@ -18,8 +18,9 @@ from rosbags.rosbag2.errors import WriterError
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from aeropend_ident.bags.bag import Bag, RecordingError
+from aeropend_ident.bags.container import Bag
 from aeropend_ident.bags.msgtypes import learn
+from aeropend_ident.bags.reading import RecordingError
 from aeropend_ident.bags.writer import BagWriter
 from aeropend_sim.cli.command import EXIT_CODES, Parser, entry_point
 from aeropend_sim.cli.progress import Show, nothing, progress

@@ -32,7 +32,7 @@ from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLi
 from rosbags.rosbag2.errors import WriterError
 from rosbags.typesys import Stores, get_typestore
 
-from aeropend_ident.bags.bag import STORAGES
+from aeropend_ident.bags.container import STORAGES
 from aeropend_ident.bags.msgtypes import learn, message_class
 from aeropend_ident.bags.writer import PLUGINS, BagWriter
 from aeropend_sim.errors import UserError

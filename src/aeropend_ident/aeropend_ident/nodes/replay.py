@@ -24,8 +24,9 @@ from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosDurability
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
-from aeropend_ident.bags.bag import Bag, RecordingError
+from aeropend_ident.bags.container import Bag
 from aeropend_ident.bags.msgtypes import message_class
+from aeropend_ident.bags.reading import RecordingError
 from aeropend_ident.bags.recording import split_topic
 from aeropend_sim.errors import UserError
 from aeropend_sim.ros import interface
