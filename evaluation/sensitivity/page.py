@@ -43,8 +43,8 @@ NOTES = (
     decisions" are the regions that are reported, the pairs of hypotheses that are not separable, the number of reasons
     for an unknown effect, and the parameters that are determined; they are counted where the verdict is the same.""",
     """`GROWTH`, `PEAK`, `NOTICEABLE`, `FORM_SHOWS`, `SCATTER` and `GOOD_ENOUGH` are ratios near 1. Times 0.7 they are
-    below 1: pure noise then counts as a misfit, and a free swing as a push. A change of the verdict is then expected.
-    """)
+    below 1: noise then counts as a misfit, a true speed as a false capture, and a free swing as a push. A change of the
+    verdict is then expected.""")
 """What the table does not say itself."""
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ Measured: at ±30 % no verdict of 2 recordings changes (docs/results/thresholds.
 GROWTH = 1.03
 """Ratio of a swing to the one before above which the arm was pushed (choice: reading errors stay below).
 
-Measured: ×0.7 changes 2 of 2 verdicts, ×1.3 none (docs/results/thresholds.md)."""
+Measured: ×0.7, which is below 1, changes 2 of 2 verdicts, ×1.3 none (docs/results/thresholds.md)."""
 
 
 @dataclass(frozen=True)
