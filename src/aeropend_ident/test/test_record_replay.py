@@ -12,8 +12,9 @@ from rosbags.rosbag2 import Reader
 
 from aeropend_ident.bags.container import Bag
 from aeropend_ident.bags.recording import read
-from aeropend_ident.nodes.record import Tap, losses
+from aeropend_ident.nodes.record import losses
 from aeropend_ident.nodes.replay import Plan
+from aeropend_ident.nodes.topic_recorder import TopicRecorder
 
 FLOAT = "std_msgs/msg/Float64"
 
@@ -160,7 +161,7 @@ class Told:
     ([(2, [7]), (2, [8]), (2, [9]), (2, [11])], 0),  # the first of the other?
     ([(1, [1, 2]), (0, []), (1, [700, 702]), (1, [703, 705])], 1)])  # fmt: skip
 def test_what_is_lost_is_told_by_the_numbers_of_its_publishers(looks, lost):
-    tap = Tap("joint_states", "sensor_msgs/msg/JointState")
+    tap = TopicRecorder("joint_states", "sensor_msgs/msg/JointState")
     for publishers, numbers in looks:
         tap.count_publishers(publishers, 0.0)
         tap.subscription = Told(numbers)
@@ -175,7 +176,7 @@ def test_what_is_lost_is_told_by_the_numbers_of_its_publishers(looks, lost):
     ([(0.0, 1, [1, 2]), (50.0, 1, [5]), (50.2, 0, []), (60.0, 1, [1, 3]), (60.2, 1, [4]), (60.4, 1, [6]),
       (60.6, 1, [7]), (61.6, 1, [9])], 1)])  # fmt: skip
 def test_what_is_lost_of_a_new_publisher_is_told_apart(looks, joining):
-    tap = Tap("joint_states", "sensor_msgs/msg/JointState")
+    tap = TopicRecorder("joint_states", "sensor_msgs/msg/JointState")
     for now, publishers, numbers in looks:
         tap.count_publishers(publishers, now)
         tap.subscription = Told(numbers)
@@ -443,7 +444,7 @@ def one_line(process, program):
     ("arguments", "message"),
     [
         (["there"], "there exists: give another name, or -p overwrite:=true to replace it"),
-        (["there", "--ros-args", "-p", "overwrite:=true"], "there is no bag, or holds other files too"),
+        (["there", "--ros-args", "-p", "overwrite:=true"], "there is not a bag, or holds other files too"),
         (["file"], "file exists"),
         (["file/bag"], "file/bag: cannot be written: Not a directory"),
         (["a", "b"], "one OUT only, not a b"),
@@ -451,8 +452,8 @@ def one_line(process, program):
         (["a", "--ros-args", "-p", "duration:=-1.0"], "parameter duration is -1: give 0 to"),
         (["a", "--ros-args", "-p", "duraton:=1.0"], "unknown parameter duraton: did you mean duration?"),
         (["a", "--ros-args", "-p", "storage:=paper"], "parameter storage is 'paper': give one of mcap, sqlite3"),
-        (["a", "--ros-args", "-p", "topics:=a b"], "'a b' is no topic name"),
-        (["a", "--ros-args", "-p", "while_published:=1x"], "'1x' is no topic name"),
+        (["a", "--ros-args", "-p", "topics:=a b"], "'a b' is not a topic name"),
+        (["a", "--ros-args", "-p", "while_published:=1x"], "'1x' is not a topic name"),
     ],
 )
 def test_record_refuses(processes, arguments, message):
@@ -502,7 +503,7 @@ def test_overwrite_replaces_a_bag(bags, processes):
 
 @pytest.mark.parametrize("program", ["record", "replay"])
 def test_help(processes, program):
-    process = processes.start("--help", module=f"aeropend_ident.{program}")
+    process = processes.start("--help", module=f"aeropend_ident.nodes.{program}")
     said, trouble = process.communicate(timeout=60)
     assert (process.returncode, trouble) == (0, "")
     assert f"{program} my_bag --ros-args" in said

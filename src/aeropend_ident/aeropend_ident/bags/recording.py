@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from aeropend_ident.bags.cdr import Block, decode
 from aeropend_ident.bags.container import Bag
 from aeropend_ident.bags.reading import RecordingError
+from aeropend_sim.wording import counted
 
 __all__ = ["CHANNELS", "Recording", "RecordingError", "Truth", "holds", "read", "split_topic"]
 
@@ -257,9 +258,9 @@ class _Join:
                 notes.append("no stamp of armature equals one of joint_states: armature is left out")
                 armature = empty
             elif alone := len(joints.stamps) - common:
-                notes.append(f"{_many(alone, 'sample')} of joint_states {_has(alone)} no armature of the same stamp")
+                notes.append(f"{counted(alone, 'sample')} of joint_states {_has(alone)} no armature of the same stamp")
             if common and (alone := len(armature.stamps) - common):
-                notes.append(f"{_many(alone, 'sample')} of armature {_has(alone)} no joint_states of the same stamp")
+                notes.append(f"{counted(alone, 'sample')} of armature {_has(alone)} no joint_states of the same stamp")
         self.stamps = np.union1d(joints.stamps, armature.stamps)
         if not len(self.stamps):
             raise RecordingError(f"no sample could be read: {'; '.join(notes)}")
@@ -283,11 +284,11 @@ class _Join:
             self.notes.append(f"not measured: {', '.join(unmeasured)}")
         if self.duplicates:
             repeat = "repeats" if self.duplicates == 1 else "repeat"
-            self.notes.append(f"{_many(self.duplicates, 'message')} {repeat} a stamp: the first of each counts")
+            self.notes.append(f"{counted(self.duplicates, 'message')} {repeat} a stamp: the first of each counts")
         if len(self.gaps):
             missing = int(self.gaps[:, 1].sum())
             are = "is" if missing == 1 else "are"
-            self.notes.append(f"{_many(missing, 'sample')} {are} missing in {_many(len(self.gaps), 'gap')}")
+            self.notes.append(f"{counted(missing, 'sample')} {are} missing in {counted(len(self.gaps), 'gap')}")
         if self.irregular > IRREGULAR * len(self.stamps) or len(self.gaps) > 0.25 * len(self.stamps):
             self.notes.append("the stamps do not lie on one grid: two rigs on one topic, or most samples were lost")
         return Recording(
@@ -347,7 +348,7 @@ class _Join:
     def _decode(self, series: _Series) -> list[Block]:
         blocks, failed = decode(series.messages, series.msgtype)
         if failed:
-            self.notes.append(f"{_many(len(failed), 'message')} of {series.topic} could not be decoded")
+            self.notes.append(f"{counted(len(failed), 'message')} of {series.topic} could not be decoded")
         return blocks
 
     def _table(self, series: _Series, blocks: list[Block], columns: dict[str, Floats]) -> _Table:
@@ -410,10 +411,6 @@ def _grid(stamps: Stamps) -> tuple[float, Stamps, int]:
     period = float(steps[usual].mean()) / 1e9
     irregular = int(np.sum(np.abs(steps / np.median(steps) - periods) > OFF_GRID))
     return period, np.stack((before, periods[before] - 1), axis=1), irregular
-
-
-def _many(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _has(number: int) -> str:

@@ -25,12 +25,13 @@ from aeropend_ident.tables import files
 from aeropend_ident.tables.clock import CLOCKS
 from aeropend_ident.tables.guess import Guess, guess, is_obvious, option, options
 from aeropend_ident.tables.mapping import Plan, Samples, no_time, samples
-from aeropend_ident.tables.table import Table, TableError, many
+from aeropend_ident.tables.table import Table, TableError
 from aeropend_ident.tables.units import UNITS, listed
 from aeropend_ident.tables.write import BagExistsError, write
 from aeropend_sim.cli.command import EXIT_CODES, Parser, between, entry_point, own
 from aeropend_sim.cli.progress import progress
 from aeropend_sim.untrusted import one_line, printable
+from aeropend_sim.wording import counted
 
 DELIMITERS = {"tab": "\t", "blank": " ", "blanks": " ", "space": " ", "\\t": "\t"}
 
@@ -163,7 +164,7 @@ def run(given: argparse.Namespace, arguments: Sequence[str]) -> int:
                 show(0.0, f"writing {printable(bag.name)}")
                 write(bag, taken, about(file, arguments, taken), show)
         except (TableError, BagExistsError) as error:
-            ready = f" ({many(done, 'recording')} before it {'is' if done == 1 else 'are'} made)" if done else ""
+            ready = f" ({counted(done, 'recording')} before it {'is' if done == 1 else 'are'} made)" if done else ""
             raise TableError(f"{error}{ready}") from None
         except OSError as error:
             raise TableError(f"{bag}: cannot be written: {error.strerror or error}") from None
@@ -202,7 +203,7 @@ def tell(bag: Path, file: Path, taken: Samples) -> None:
     """
     seconds = float(taken.stamp_ns[-1] - taken.stamp_ns[0]) * 1e-9
     rate = taken.rows / max(seconds, 1e-9)
-    lines = [f"{bag}: {many(taken.rows, 'row')} of {file.name}, {seconds:.1f} s, {rate:.4g} a second"]
+    lines = [f"{bag}: {counted(taken.rows, 'row')} of {file.name}, {seconds:.1f} s, {rate:.4g} a second"]
     lines += [f"  {line}" for line in taken.mapping] + [f"  note: {line}" for line in taken.notes]
     if taken.left_out:
         lines.append(f"  left out: column{'s' * (len(taken.left_out) > 1)} {', '.join(taken.left_out)}")
@@ -232,7 +233,7 @@ def propose(table: Table, found: Sequence[Guess], chosen: dict[str, str], given:
         what = f"{one.quantity}{'' if one.sure else '?'} ({one.why})" if one.quantity else one.why or "?"
         cells = (table.label(k), "  ".join(column.shown), low_high, what)
         shown.add_row(*(escape(printable(cell)) for cell in cells))
-    print(printable(f"{table.path}: {many(len(table), 'row')}"))
+    print(printable(f"{table.path}: {counted(len(table), 'row')}"))
     for note in table.notes:
         print(f"  {printable(note)}")
     console.print(shown)

@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node that records a rig's topics into a rosbag2 bag.
 
-Messages are written as they come off the wire, with the time at which the middleware received them. A thread takes
-them from the subscriptions in bunches, without an executor in between: that costs a fraction of the time, and what
-arrives while the disk is slow waits in the middleware, up to ten seconds of it. Twice a second the bag is made whole
-on disk, so a recording that is killed opens like any other and ends at most half a second early.
+Serialized messages are written with the time at which the middleware received them. A thread takes them from the
+subscriptions in batches, without an executor: that costs a fraction of the time. While the disk is slow, messages wait
+in the middleware, for up to ten seconds. Twice a second a checkpoint makes the bag complete on disk, so a recording
+that is killed opens like any other and ends at most half a second early.
 """
 
 from __future__ import annotations
 
 import errno
-import math
 import shutil
 import sqlite3
 import sys
@@ -19,22 +18,21 @@ import time
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.validate_topic_name import validate_topic_name
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
-from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.interfaces import Connection
 from rosbags.rosbag2.errors import WriterError
 from rosbags.typesys import Stores, get_typestore
 
 from aeropend_ident.bags.container import STORAGES
-from aeropend_ident.bags.msgtypes import learn, message_class
+from aeropend_ident.bags.msgtypes import learn
 from aeropend_ident.bags.writer import PLUGINS, BagWriter
+from aeropend_ident.nodes.topic_recorder import TopicRecorder, qos_for, qos_of
 from aeropend_sim.errors import UserError
 from aeropend_sim.ros import interface
 from aeropend_sim.ros.diagnostics import Diagnostics
@@ -44,15 +42,16 @@ from aeropend_sim.ros.usage import no_options, usage
 from aeropend_sim.ros.worker import Worker
 
 TAKE_S = 0.01
+"""[s] Time between two readings of the subscriptions (choice: much shorter than the middleware holds messages)."""
+
 CHECKPOINT_S = 0.5
+"""[s] Time between two checkpoints of the bag: what a kill may lose (choice)."""
+
 LOOK_S = 0.2
-"""How often new publishers are looked for, s."""
-JOINING_S = 1.2
-"""While a publisher and its listeners find each other the middleware may lose what is sent in between, s."""
+"""[s] Time between two looks for new publishers (choice)."""
+
 SILENT_S = 2.0
-"""A topic of the sample rate that is silent for longer is reported, s."""
-DEPTH = 5000
-"""Messages the middleware holds for us: ten seconds at the sample rate."""
+"""[s] Time without a message after which a sampled topic is reported (choice: a thousand sample periods)."""
 
 SAMPLED = {
     interface.JOINT_STATES: "sensor_msgs/msg/JointState",
@@ -72,10 +71,10 @@ TRUTH = {
 SETTINGS = {
     "storage": Setting("mcap", "file format", choices=tuple(PLUGINS)),
     "duration": Setting(0.0, "end this long after the first message of the rig; 0: no end", "s", 0.0, 1e6),
-    "while_published": Setting("", "end when the last publisher of this topic has gone"),
+    "while_published": Setting("", "end when this topic has no publisher any more"),
     "truth": Setting(False, "record truth/joint_states and truth/armature too"),
-    "topics": Setting("", "more topics to record, with commas between them"),
-    "all": Setting(False, "record every topic there is"),
+    "topics": Setting("", "further topics to record, separated by commas"),
+    "all": Setting(False, "record all topics"),
     "overwrite": Setting(False, "replace the bag OUT if there is one"),
 }
 
@@ -89,88 +88,19 @@ USAGE = usage(
         "record my_bag --ros-args -p while_published:=duty_command",
         "record my_bag --ros-args -r __ns:=/rig1 -p truth:=true -p storage:=sqlite3",
     ],
-    "  OUT is named after the time when it is left out. Ctrl-C ends the recording.",
+    "  Without OUT the bag is named after the time. Ctrl-C ends the recording.",
     "OUT",
 )
-
-
-class Tap:
-    """One recorded topic.
-
-    Attributes:
-        count: messages written.
-        lost: messages that were published to us and did not arrive, as far as their numbers tell.
-        lost_joining: those of them while a publisher was new.
-        heard: when the last message came (monotonic, s); when the tap was opened, before the first.
-    """
-
-    def __init__(self, topic: str, msgtype: str) -> None:
-        self.topic = topic
-        self.msgtype = msgtype
-        self.message_class = message_class(msgtype)
-        self.subscription: Any = None
-        self.qos: QoSProfile | None = None
-        self.connection: Connection | None = None
-        self.count = 0
-        self.lost = self.lost_joining = 0
-        self.heard = time.monotonic()
-        self.silent = False
-        self.publishers = 0
-        self._last: list[int] = []  # number of each publisher's last message, by its own count; the latest at the end
-        self._skipped = 0
-        self._settled = True  # nobody has been there yet, so whoever comes first is alone
-        self._heard_of = False
-        self._joined = -math.inf
-
-    def take(self) -> tuple[int, bytes] | None:
-        """Take the next message: receive time (ns, 0 if unknown) and what was on the wire. None when there is none."""
-        handle = self.subscription.handle
-        with handle:
-            taken = handle.take_message(self.message_class, True)
-        if taken is None:
-            return None
-        message, info = taken
-        number = info["publication_sequence_number"]
-        if number is not None:
-            # who it is from is not told; of those that it may follow, the nearest: the sum is right whichever it was
-            before = max((last for last in self._last if last < number), default=None)
-            all_known = len(self._last) >= self.publishers
-            if before is not None and (all_known or before == number - 1):
-                self._skipped += number - before - 1
-                self._last.remove(before)
-            self._last.append(number)
-        return info["received_timestamp"], message
-
-    def count_publishers(self, publishers: int, now: float) -> None:
-        """Note how many publishers there are now (monotonic, s).
-
-        Numbers tell what was lost as long as it is the same publishers. The interval after one has come or gone counts
-        as little: it begins with what waits from all.
-        """
-        alone = publishers <= 1 and (self.publishers == 1 or not self._heard_of)
-        settled = alone or publishers == self.publishers > 1
-        if settled and self._settled:
-            self.lost += self._skipped
-            if now <= self._joined + JOINING_S:
-                self.lost_joining += self._skipped
-            self._last = self._last[-max(publishers, 1):]
-        else:
-            self._last.clear()
-        if publishers > self.publishers:
-            self._joined = now
-        self._skipped, self._settled = 0, settled
-        self._heard_of |= publishers > 0
-        self.publishers = publishers
 
 
 class Record(Node):
     """The node; see the module's docstring."""
 
     def __init__(self, out: Path) -> None:
-        """Prepare to record into `out`.
+        """Prepare the recording.
 
         Raises:
-            UserError: a parameter is wrong, or `out` is there.
+            UserError: a parameter is wrong, or `out` exists.
         """
         super().__init__("record", automatically_declare_parameters_from_overrides=True)
         settings = read_settings(self, SETTINGS, overrides(self))
@@ -186,7 +116,7 @@ class Record(Node):
         self._follow = self._resolve(follow) if follow else ""
         self._follow_seen = False
         self._follow_gone: float | None = None
-        self._taps: dict[str, Tap] = {}
+        self._recorders: dict[str, TopicRecorder] = {}
         self._refused: set[tuple[str, str]] = set()
         if out.exists() and settings["overwrite"]:
             _remove_bag(out)
@@ -195,8 +125,8 @@ class Record(Node):
         except WriterError as error:
             raise UserError(f"{out} exists: give another name, or -p overwrite:=true to replace it") from error
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
-        # A node of its own, which no executor serves: its subscriptions are read by the thread below.
-        self._ears = Node(
+        # No executor serves this node: the thread below reads its subscriptions.
+        self._subscriber = Node(
             f"_{self.get_name()}_subscriptions",
             namespace=self.get_namespace(),
             context=self.context,
@@ -214,7 +144,7 @@ class Record(Node):
         """Write what is left and close the bag."""
         self._worker.stop()
         self._display.stop()
-        self._ears.destroy_node()
+        self._subscriber.destroy_node()
         if getattr(self, "error", None) is None:
             self._display.say(self._summary())
 
@@ -222,7 +152,7 @@ class Record(Node):
         try:
             validate_topic_name(topic)
         except InvalidTopicNameException as error:
-            raise UserError(f"'{topic}' is no topic name") from error
+            raise UserError(f"'{topic}' is not a topic name") from error
         return str(self.resolve_topic_name(topic))
 
     # ---- the thread ------------------------------------------------------------------------------------------------
@@ -231,7 +161,7 @@ class Record(Node):
         stored = 0
         try:
             self._writer.open()
-            checkpoint = look = time.monotonic()
+            checkpoint = look = now = time.monotonic()
             ends = False
             while not ends:
                 now = time.monotonic()
@@ -239,16 +169,16 @@ class Record(Node):
                 if now >= look or ends:
                     self._look(now)
                     look = now + LOOK_S
-                until = time.time_ns() if ends else None  # all topics end there, however long it takes to write them
-                for tap in self._taps.values():
-                    self._drain(tap, until)
+                until = time.time_ns() if ends else None  # all topics end at this time, however long the writing takes
+                for recorder in self._recorders.values():
+                    self._drain(recorder, until)
                 if now >= checkpoint and not ends:
                     self._writer.checkpoint()
                     stored = sum(self._writer.counts.values())
                     checkpoint = now + CHECKPOINT_S
                 self._display.update(now)
-            for tap in self._taps.values():
-                tap.count_publishers(tap.publishers, now)
+            for recorder in self._recorders.values():
+                recorder.count_publishers(recorder.publishers, now)
             self._writer.close()
         except (OSError, sqlite3.Error, WriterError) as error:
             raise self._failure(error, stored) from error
@@ -260,37 +190,37 @@ class Record(Node):
         number = getattr(error, "errno", None)
         full = number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or "full" in str(error)
         what = "the disk is full" if full else getattr(error, "strerror", None) or str(error)
-        what = what.replace("disk I/O error", "the disk is full or fails")  # SQLite knows no more of some file systems
+        what = what.replace("disk I/O error", "the disk is full or fails")  # SQLite reports no more on some disks
         if stored:
             return UserError(f"{self._out}: {what}: the recording ends here, {stored} messages are safe in it")
         shutil.rmtree(self._out, ignore_errors=True)
         return UserError(f"{self._out}: cannot be written: {what}")
 
-    def _drain(self, tap: Tap, until: int | None = None) -> None:
-        while (taken := tap.take()) is not None:
+    def _drain(self, recorder: TopicRecorder, until: int | None = None) -> None:
+        while (taken := recorder.take()) is not None:
             received, message = taken
             if until is not None and received > until:
                 return
-            if tap.connection is None:
-                tap.connection = self._connect(tap)
-            self._writer.write(tap.connection, received or time.time_ns(), message)
-            tap.count += 1
-            tap.heard = time.monotonic()
-            if self._first is None and tap.topic != interface.DIAGNOSTICS:  # ours and other nodes' are always there
-                self._first = tap.heard
+            if recorder.connection is None:
+                recorder.connection = self._connect(recorder)
+            self._writer.write(recorder.connection, received or time.time_ns(), message)
+            recorder.count += 1
+            recorder.heard = time.monotonic()
+            if self._first is None and recorder.topic != interface.DIAGNOSTICS:  # every node publishes it all the time
+                self._first = recorder.heard
 
-    def _connect(self, tap: Tap) -> Connection:
-        """Enter a topic in the bag, with the QoS its publishers offer."""
-        publishers = self.get_publishers_info_by_topic(tap.topic)
+    def _connect(self, recorder: TopicRecorder) -> Connection:
+        """Add a topic to the bag, with the QoS that its publishers offer."""
+        publishers = self.get_publishers_info_by_topic(recorder.topic)
         return self._writer.add_connection(
-            tap.topic,
-            tap.msgtype,
+            recorder.topic,
+            recorder.msgtype,
             typestore=self._typestore,
-            offered_qos_profiles=[_qos_of(info.qos_profile) for info in publishers],
+            offered_qos_profiles=[qos_of(info.qos_profile) for info in publishers],
         )
 
     def _look(self, now: float) -> None:
-        """Subscribe to what has appeared, with a QoS that hears all its publishers."""
+        """Subscribe to new topics, with a QoS that all their publishers are compatible with."""
         wanted = dict(self._wanted)
         if self._everything or not all(wanted.values()):
             for topic, types in self.get_topic_names_and_types():
@@ -298,7 +228,7 @@ class Record(Node):
                     wanted[topic] = types[0]
         for topic, msgtype in wanted.items():
             if msgtype and (topic, msgtype) not in self._refused:
-                self._tap(topic, msgtype, now)
+                self._update(topic, msgtype, now)
         if self._follow:
             there = self.count_publishers(self._follow) > 0
             self._follow_seen = self._follow_seen or there
@@ -307,44 +237,45 @@ class Record(Node):
             elif self._follow_gone is None:
                 self._follow_gone = now
 
-    def _tap(self, topic: str, msgtype: str, now: float) -> None:
-        tap = self._taps.get(topic)
-        if tap is None:
+    def _update(self, topic: str, msgtype: str, now: float) -> None:
+        recorder = self._recorders.get(topic)
+        if recorder is None:
             try:
-                tap = Tap(topic, msgtype)
+                recorder = TopicRecorder(topic, msgtype)
                 learn(self._typestore, msgtype)
             except LookupError as error:
                 self._refused.add((topic, msgtype))
                 self._display.say(f"{topic} is not recorded: {error}", warn=True)
                 return
-            self._taps[topic] = tap
+            self._recorders[topic] = recorder
         publishers = self.get_publishers_info_by_topic(topic)
-        tap.count_publishers(len(publishers), now)
-        qos = _qos_for([info.qos_profile for info in publishers])
-        if tap.subscription is None or (tap.publishers and qos != tap.qos):
-            if tap.subscription is not None:
-                self._drain(tap)
-                self._ears.destroy_subscription(tap.subscription)
-            tap.qos = qos
-            tap.subscription = self._ears.create_subscription(tap.message_class, topic, _ignore, qos, raw=True)
-        silent = topic in self._sampled and now - tap.heard > SILENT_S
-        if silent and not tap.silent:
-            since = "no message yet" if not tap.count else "silent"
-            self._display.say(f"{topic}: {since}, {tap.publishers} publishers", warn=True)
-        elif tap.silent and not silent:
+        recorder.count_publishers(len(publishers), now)
+        qos = qos_for([info.qos_profile for info in publishers])
+        if recorder.subscription is None or (recorder.publishers and qos != recorder.qos):
+            if recorder.subscription is not None:
+                self._drain(recorder)
+                self._subscriber.destroy_subscription(recorder.subscription)
+            recorder.qos = qos
+            recorder.subscription = self._subscriber.create_subscription(recorder.message_class, topic, _ignore, qos,
+                                                                         raw=True)
+        silent = topic in self._sampled and now - recorder.heard > SILENT_S
+        if silent and not recorder.silent:
+            since = "no message yet" if not recorder.count else "silent"
+            self._display.say(f"{topic}: {since}, {recorder.publishers} publishers", warn=True)
+        elif recorder.silent and not silent:
             self._display.say(f"{topic}: messages again")
-        tap.silent = silent
+        recorder.silent = silent
 
     def _is_over(self, now: float) -> bool:
         if self._duration and self._first is not None and now - self._first >= self._duration:
             return True
         return self._follow_gone is not None and now - self._follow_gone >= CHECKPOINT_S
 
-    # ---- what is told ----------------------------------------------------------------------------------------------
+    # ---- reports ----------------------------------------------------------------------------------------------
 
-    def taps(self) -> list[Tap]:
+    def recorders(self) -> list[TopicRecorder]:
         """Return the topics recorded so far."""
-        return list(self._taps.values())
+        return list(self._recorders.values())
 
     def elapsed(self, now: float) -> float:
         """Return the time since the first message, s."""
@@ -360,16 +291,16 @@ class Record(Node):
         if end == 0:
             return f"{self._out}: no message was received; the bag is empty"
         span = (end - start) / 1e9
-        parts = [f"{self.shorten(tap.topic)} {tap.count}" for tap in self.taps() if tap.count]
-        lost = {self.shorten(tap.topic): tap.lost for tap in self.taps()}
-        joining = sum(tap.lost_joining for tap in self.taps())
+        parts = [f"{self.shorten(recorder.topic)} {recorder.count}" for recorder in self.recorders() if recorder.count]
+        lost = {self.shorten(recorder.topic): recorder.lost for recorder in self.recorders()}
+        joining = sum(recorder.lost_joining for recorder in self.recorders())
         return f"{self._out}: {span:.1f} s recorded: {', '.join(parts)}; {losses(lost, joining)}"
 
     def _report(self) -> tuple[str, Mapping[str, object]]:
-        taps = self.taps()
-        counters: dict[str, object] = {"bag": self._out, "lost": sum(tap.lost for tap in taps)}
-        counters |= {self.shorten(tap.topic): tap.count for tap in taps}
-        silent = [self.shorten(tap.topic) for tap in taps if tap.silent]
+        recorders = self.recorders()
+        counters: dict[str, object] = {"bag": self._out, "lost": sum(recorder.lost for recorder in recorders)}
+        counters |= {self.shorten(recorder.topic): recorder.count for recorder in recorders}
+        silent = [self.shorten(recorder.topic) for recorder in recorders if recorder.silent]
         return f"silent: {', '.join(silent)}" if silent else "", counters
 
 
@@ -388,16 +319,16 @@ class _Display:
             self._live.start()
 
     def update(self, now: float) -> None:
-        """Show the rates when it is time to."""
+        """Show the rates, if the last time was long enough ago."""
         if now - self._at < self._every:
             return
         parts = []
-        for tap in self._node.taps():
-            rate = (tap.count - self._counts.get(tap.topic, 0)) / (now - self._at)
-            self._counts[tap.topic] = tap.count
-            if tap.count:
-                lost = f" lost {tap.lost}" if tap.lost else ""
-                parts.append(f"{self._node.shorten(tap.topic)} {rate:.1f} Hz{lost}")
+        for recorder in self._node.recorders():
+            rate = (recorder.count - self._counts.get(recorder.topic, 0)) / (now - self._at)
+            self._counts[recorder.topic] = recorder.count
+            if recorder.count:
+                lost = f" lost {recorder.lost}" if recorder.lost else ""
+                parts.append(f"{self._node.shorten(recorder.topic)} {rate:.1f} Hz{lost}")
         self._at = now
         line = f"{self._node.elapsed(now):.0f}{self._of} s   {'   '.join(parts) or 'waiting for messages'}"
         if self._live:
@@ -406,7 +337,7 @@ class _Display:
             self._node.get_logger().info(line)
 
     def say(self, text: str, *, warn: bool = False) -> None:
-        """Say something once."""
+        """Print a line that stays."""
         if self._live:
             self._console.print(Text(text, style="yellow" if warn else ""))
         elif warn:
@@ -415,13 +346,13 @@ class _Display:
             self._node.get_logger().info(text)
 
     def stop(self) -> None:
-        """Take the changing line away."""
+        """Remove the line that changes."""
         if self._live:
             self._live.stop()
 
 
 def losses(lost: Mapping[str, int], joining: int) -> str:
-    """Say how many messages of each topic were lost, and how many of them while a publisher was new."""
+    """A sentence on the messages lost of each topic, and on those lost while a publisher was new."""
     if not any(lost.values()):
         return "none lost"
     of = ", ".join(f"{topic} {count}" for topic, count in lost.items() if count)
@@ -430,45 +361,14 @@ def losses(lost: Mapping[str, int], joining: int) -> str:
 
 
 def _ignore(message: bytes) -> None:
-    """Stand in for the callback that an executor would call."""
-
-
-def _qos_for(offered: list[QoSProfile]) -> QoSProfile:
-    """Choose a QoS that is compatible with every publisher, and the strictest that is."""
-    reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
-    latched = bool(offered) and all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=DEPTH,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
-
-
-def _qos_of(qos: QoSProfile) -> Qos:
-    """Turn rclpy's QoS into rosbags'."""
-    return Qos(
-        QosHistory(qos.history.value),
-        qos.depth,
-        QosReliability(qos.reliability.value),
-        QosDurability(qos.durability.value),
-        _time(qos.deadline.nanoseconds),
-        _time(qos.lifespan.nanoseconds),
-        QosLiveliness(qos.liveliness.value),
-        _time(qos.liveliness_lease_duration.nanoseconds),
-        qos.avoid_ros_namespace_conventions,
-    )
-
-
-def _time(nanoseconds: int) -> QosTime:
-    return QosTime(*divmod(nanoseconds, 1_000_000_000))
+    """A callback that is never called: no executor serves the subscription."""
 
 
 def _remove_bag(path: Path) -> None:
     """Remove a bag, and only a bag."""
     parts = (*STORAGES, "metadata.yaml")
     if not path.is_dir() or not all(any(part in file.name for part in parts) for file in path.iterdir()):
-        raise UserError(f"{path} is no bag, or holds other files too: it is not overwritten, give another name")
+        raise UserError(f"{path} is not a bag, or holds other files too: it is not overwritten, give another name")
     shutil.rmtree(path)
 
 

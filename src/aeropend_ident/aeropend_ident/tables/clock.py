@@ -26,8 +26,9 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from scipy.signal import savgol_filter
 from scipy.stats import theilslopes
 
-from aeropend_ident.tables.table import Floats, Ints, many
+from aeropend_ident.tables.table import Floats, Ints
 from aeropend_sim.errors import UserError
+from aeropend_sim.wording import counted
 
 CLOCKS = ("auto", "even", "stamps")
 
@@ -152,9 +153,9 @@ def date(time: Floats, angle: Floats, lines: Ints, *, is_clock: bool = False, ti
     rows = np.flatnonzero(np.isfinite(time))
     notes = []
     if len(rows) < len(time):
-        notes.append(f"{many(len(time) - len(rows), 'row')} without a time left out")
+        notes.append(f"{counted(len(time) - len(rows), 'row')} without a time left out")
     if len(rows) < 3:
-        raise ClockError(f"{many(len(rows), 'row')} with a time: too few for a recording")
+        raise ClockError(f"{counted(len(rows), 'row')} with a time: too few for a recording")
     t, n = _unwrapped(time[rows], is_clock, tick)
     if n:
         notes.append(f"the clock starts anew {n if n > 1 else 'once'}{' times' if n > 1 else ''}: counted on")
@@ -242,7 +243,7 @@ def _without_repeats(t: Floats, rows: Ints, repeats: NDArray[np.bool_], notes: l
     same = np.concatenate(([False], np.diff(t) == 0.0))
     if not same.any() or not repeats[rows][same].all():
         return t, rows
-    notes.append(f"{many(int(same.sum()), 'row')} repeating the row before left out")
+    notes.append(f"{counted(int(same.sum()), 'row')} repeating the row before left out")
     return t[~same], rows[~same]
 
 
@@ -254,7 +255,7 @@ def _sorted(t: Floats, rows: Ints, notes: list[str]) -> tuple[Floats, Ints]:
     back = np.diff(t) < 0.0
     if not (back.all() or back.mean() <= REPEATED) or _grid(t[order]) is None:
         return t, rows
-    notes.append(f"{many(int((np.diff(t) < 0.0).sum()), 'row')} out of order: rows sorted by their time")
+    notes.append(f"{counted(int((np.diff(t) < 0.0).sum()), 'row')} out of order: rows sorted by their time")
     return t[order], rows[order]
 
 
@@ -415,7 +416,7 @@ def _tell_jumps(grid: _Grid, lines: Ints, notes: list[str]) -> None:
     gaps = grid.steps > 0.0
     if gaps.any():
         missing = int(np.rint(grid.steps[gaps].sum() / grid.period))
-        notes.append(f"{many(int(gaps.sum()), 'gap')}, {many(missing, 'row')} missing, first after line "
+        notes.append(f"{counted(int(gaps.sum()), 'gap')}, {counted(missing, 'row')} missing, first after line "
                      f"{lines[grid.jumps[gaps][0]]}: left open")
     back = grid.steps < 0.0
     if back.sum() > MOST_BACK:
@@ -509,14 +510,14 @@ def _on_fine(t: Floats, rows: Ints, lines: Ints, notes: list[str]) -> Dated:
     """Put irregular rows on a grid that is fine enough not to move them."""
     back = np.diff(t) < 0.0
     if back.any():
-        raise ClockError(f"{many(int(back.sum()), 'row')} with a time before that of the row before: the stamps cannot "
-                         "be right; leave --clock stamps away")
+        raise ClockError(f"{counted(int(back.sum()), 'row')} with a time before that of the row before: the stamps "
+                         "cannot be right; leave --clock stamps away")
     again = np.concatenate(([False], np.diff(t) == 0.0))
     if again.any():
         if again.mean() > REPEATED:
-            raise ClockError(f"{many(int(again.sum()), 'row')} with the time of the row before: the stamps cannot be "
-                             "right; leave --clock stamps away")
-        notes.append(f"{many(int(again.sum()), 'row')} with the time of the row before left out")
+            raise ClockError(f"{counted(int(again.sum()), 'row')} with the time of the row before: the stamps cannot "
+                             "be right; leave --clock stamps away")
+        notes.append(f"{counted(int(again.sum()), 'row')} with the time of the row before left out")
         t, rows, lines = t[~again], rows[~again], lines[~again]
     steps = np.diff(t)
     short = float(np.percentile(steps, 10))
@@ -529,13 +530,13 @@ def _on_fine(t: Floats, rows: Ints, lines: Ints, notes: list[str]) -> Dated:
     start = float(t[0])
     double = np.concatenate(([False], np.diff(cells) == 0))
     if double.any():
-        notes.append(f"{many(int(double.sum()), 'row')} less than {_short(0.5 * period)} after another left out")
+        notes.append(f"{counted(int(double.sum()), 'row')} less than {_short(0.5 * period)} after another left out")
         rows, lines, cells = rows[~double], lines[~double], cells[~double]
     notes.append(f"rows that are not evenly spaced: on a grid of {_short(period)}, with nothing measured in between")
     wide = np.flatnonzero(np.diff(cells) * period > UNFILLED)
     if len(wide):
-        notes.append(f"{many(len(wide), 'gap')} of more than {UNFILLED:g} s, first after line {lines[wide[0]]}: left "
-                     "open")
+        notes.append(f"{counted(len(wide), 'gap')} of more than {UNFILLED:g} s, first after line {lines[wide[0]]}: "
+                     "left open")
     if (int(cells[-1]) - int(np.diff(cells)[wide].sum())) > MOST_SAMPLES:
         raise ClockError(f"the stamps need a grid of {_short(period)}, more than {MOST_SAMPLES // 10**6} million "
                          "samples: split the file")

@@ -12,8 +12,9 @@ import numpy as np
 
 from aeropend_ident.tables import clock
 from aeropend_ident.tables.clock import ClockError, Dated
-from aeropend_ident.tables.table import Column, Floats, Ints, Table, TableError, many
+from aeropend_ident.tables.table import Column, Floats, Ints, Table, TableError
 from aeropend_ident.tables.units import CLOCK, TURN, UNITS, Unit, UnitError, known, listed, parse
+from aeropend_sim.wording import counted
 
 CHANNELS = {"theta": "theta", "omega": "omega", "current": "i_a", "voltage": "v_a", "duty": "duty"}
 """Quantity (name of the option) -> channel of a recording."""
@@ -137,7 +138,7 @@ def samples(table: Table, plan: Plan) -> Samples:
     for name in values.keys() - {"time"}:
         missing = int(np.isnan(values[name][dated.rows >= 0]).sum())
         if missing:
-            notes.append(f"{name}: {many(missing, 'row')} without a reading")
+            notes.append(f"{name}: {counted(missing, 'row')} without a reading")
     channels: dict[str, Floats] = {}
     offset = sign = 0.0
     if "theta" in chosen:
@@ -194,7 +195,7 @@ def _doubts(table: Table, chosen: dict[str, tuple[int, Unit]], channels: dict[st
 def no_time(table: Table) -> str:
     """Message on a table without a time."""
     return (f"{table.path}: no time: give --time COLUMN, or --rate HZ for evenly spaced rows; a table of steady states "
-            f"({many(len(table), 'row')}) is no recording, but bench_test takes it")
+            f"({counted(len(table), 'row')}) is no recording, but bench_test takes it")
 
 
 def find(table: Table, text: str) -> list[tuple[int, str]]:
@@ -274,14 +275,14 @@ def _readable_rows(table: Table, used: list[int], plan: Plan, notes: list[str]) 
     if not plan.skip_bad or text:
         raise TableError(min(complaints)[1] + "; mend it, or give --skip-bad to leave such rows out" * (not text))
     bad = np.unique(np.concatenate([table.bad, *(table.columns[k].bad for k in used)]))
-    notes.append(f"{many(len(bad), 'row')} that cannot be read left out, first: "
+    notes.append(f"{counted(len(bad), 'row')} that cannot be read left out, first: "
                  f"{min(complaints)[1].removeprefix(f'{table.path}: ')}")
     return np.setdiff1d(np.arange(len(table)), bad)
 
 
 def _date(table: Table, plan: Plan, chosen: dict[str, tuple[int, Unit]], keep: Ints) -> Dated:
     if len(keep) < 3:
-        raise TableError(f"{table.path}: {many(len(keep), 'row')}: too few for a recording")
+        raise TableError(f"{table.path}: {counted(len(keep), 'row')}: too few for a recording")
     if plan.time is None:
         assert plan.rate is not None
         full = clock.at_rate(len(table), plan.rate)
@@ -323,7 +324,7 @@ def _angle(table: Table, chosen: tuple[int, Unit], raw: Floats, dated: Dated, pl
     unwrap = wrapped > 0 and float(np.ptp(read[known_])) < 1.02 * TURN
     if unwrap:
         read[known_] = np.unwrap(read[known_])
-        notes.append(f"theta passes the end of its turn {many(wrapped, 'time')}: counted on")
+        notes.append(f"theta passes the end of its turn {counted(wrapped, 'time')}: counted on")
     offset = 0.0 if plan.zero is None else _zero(table, plan.zero, unit, read, dated)
     sign = -1.0 if plan.flip else 1.0
     theta = sign * (read - offset)
@@ -371,7 +372,7 @@ def _duty(table: Table, chosen: tuple[int, Unit], raw: Floats, notes: list[str])
                          f"outside 0..100 %: {why}")
     outside = int(((duty < 0.0) | (duty > 1.0)).sum())
     if outside:
-        notes.append(f"duty: {many(outside, 'row')} outside 0..100 % by less than {100.0 * CLIPPED:g} %: clipped")
+        notes.append(f"duty: {counted(outside, 'row')} outside 0..100 % by less than {100.0 * CLIPPED:g} %: clipped")
     return np.clip(duty, 0.0, 1.0)
 
 

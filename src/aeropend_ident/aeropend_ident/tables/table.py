@@ -91,17 +91,6 @@ class Table:
         return f'{number + 1} "{name}"' if name else f"{number + 1}"
 
 
-def many(number: int, what: str, plural: str = "") -> str:
-    """A number with its noun: '1 row', '3 rows'.
-
-    Args:
-        number: of things.
-        what: singular of the noun.
-        plural: plural of the noun; "": the singular with an s.
-    """
-    return f"{number} {what}" if number == 1 else f"{number} {plural or what + 's'}"
-
-
 def check_size(rows: int, columns: int, path: Path) -> None:
     """Refuse a table that is too large for the memory.
 

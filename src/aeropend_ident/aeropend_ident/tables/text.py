@@ -19,8 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
-from aeropend_ident.tables.table import MOST_BYTES, SHOWN, Column, Floats, Table, TableError, check_size, many
+from aeropend_ident.tables.table import MOST_BYTES, SHOWN, Column, Floats, Table, TableError, check_size
 from aeropend_ident.tables.units import is_unit, split_name, without_brackets
+from aeropend_sim.wording import counted
 
 SAMPLE = 400
 """Number of lines that determine the dialect (choice)."""
@@ -323,9 +324,10 @@ class _Reading:
                 block.append(self._row(*last))
         self._take(block)
         if comments:
-            self.notes.append(f"{many(comments, 'comment')} among the rows left out")
+            self.notes.append(f"{counted(comments, 'comment')} among the rows left out")
         if self.short:
-            self.notes.append(f"{many(self.short, 'row')} with fewer cells than the others: the missing ones are empty")
+            self.notes.append(f"{counted(self.short, 'row')} with fewer cells than the others: the missing ones are "
+                              "empty")
         return self._done()
 
     def _row(self, line: int, written: str, cells: list[str]) -> list[str]:
