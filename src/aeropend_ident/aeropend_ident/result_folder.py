@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder with a command's results: there whole, or not at all."""
+"""The folder with the results of a command: its name, and writing it completely or not at all."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import shutil
 import signal
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -16,11 +17,16 @@ from aeropend_sim.model.parameters import ModelError
 
 
 class OutputError(UserError):
-    """The results cannot be written; the message is one line for a person."""
+    """The results cannot be written; the message is one line for the user."""
 
 
-def check(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
-    """Make sure before the work that its results have a place.
+def ensure_free(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
+    """Make sure before the work that its results can be written.
+
+    Args:
+        out: the folder.
+        files: names of the results.
+        overwrite: whether results in it may be replaced.
 
     Raises:
         OutputError: `out` is no folder, or holds results already.
@@ -32,9 +38,41 @@ def check(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
         raise OutputError(f"{out}: holds {taken[0]} already; give another --out, or --overwrite to replace it")
 
 
+def folder_names(bags: Sequence[str], taken: Iterable[str] = ()) -> list[str]:
+    """A unique folder name for each recording: its own name, with those of the folders above it where names are equal.
+
+    Args:
+        bags: the recordings. One that is given twice gets a number.
+        taken: names that are not to be used.
+    """
+    paths = [p.absolute() if p.name not in {"", ".."} else p.resolve() for p in map(Path, bags)]
+    parts = [(*p.parts[1:-1], p.stem if p.suffix in {".mcap", ".db3"} else p.name) for p in paths]
+    depth = dict.fromkeys(parts, 1)
+    while True:
+        count = Counter("_".join(p[-d:]) for p, d in depth.items())
+        longer = [p for p, d in depth.items() if count["_".join(p[-d:])] > 1 and d < len(p)]
+        if not longer:
+            break
+        for p in longer:
+            depth[p] += 1
+    found = ["_".join(p[-depth[p]:]) for p in parts]
+    used = set(taken)
+    for j, name in enumerate(found):
+        k = 1
+        while found[j] in used:
+            k += 1
+            found[j] = f"{name}_{k}"
+        used.add(found[j])
+    return found
+
+
 @contextmanager
-def whole(out: Path, files: Sequence[str]) -> Iterator[Path]:
-    """A folder to write `files` to; they appear in `out` together, when the block ends without an exception.
+def atomic_folder(out: Path, files: Sequence[str]) -> Iterator[Path]:
+    """A temporary folder for results, which appear in `out` together when the block ends without an exception.
+
+    Args:
+        out: the folder of the results.
+        files: their names.
 
     Raises:
         OutputError: the folder cannot be made or written.
@@ -60,7 +98,7 @@ def whole(out: Path, files: Sequence[str]) -> Iterator[Path]:
 
 @contextmanager
 def on_interrupt(handler: Callable[[int, object], object] | signal.Handlers) -> Iterator[None]:
-    """What Ctrl-C does in here; nothing changes in another thread than the main one, which alone is interrupted."""
+    """Handle Ctrl-C by this handler. Only the main thread is interrupted; in other threads nothing changes."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -73,7 +111,7 @@ def on_interrupt(handler: Callable[[int, object], object] | signal.Handlers) -> 
 
 @contextmanager
 def _interrupts_wait() -> Iterator[None]:
-    """Ctrl-C in here takes effect when it ends: what is begun, and takes a moment, is done."""
+    """Ctrl-C in this block takes effect at its end."""
     came = []
     with on_interrupt(lambda *_: came.append(True)):
         yield

@@ -14,7 +14,8 @@ import pytest
 from commands import Command
 
 from aeropend_ident.commands import diagnose
-from aeropend_ident.diagnosis import batch
+from aeropend_ident.diagnosis import batch, dask_cluster
+from aeropend_ident.result_folder import folder_names
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import rig
 
@@ -183,11 +184,11 @@ def test_without_dask_one_line_says_how_to_get_it(recordings, here, tmp_path, mo
 
 
 def test_a_scheduler_that_does_not_answer_or_has_no_worker_is_said(monkeypatch):
-    monkeypatch.setattr(batch, "ANSWER_WITHIN", 1.0)
-    with pytest.raises(batch.ClusterError, match="nothing answers there"), batch.cluster("tcp://127.0.0.1:9"):
+    monkeypatch.setattr(dask_cluster, "ANSWER_WITHIN", 1.0)
+    with pytest.raises(dask_cluster.ClusterError, match="nothing answers there"), dask_cluster.cluster("tcp://127.0.0.1:9"):
         pass
     with (distributed.LocalCluster(n_workers=0, dashboard_address=":0") as empty,
-          pytest.raises(batch.ClusterError, match="no worker"), batch.cluster(empty.scheduler_address)):
+          pytest.raises(dask_cluster.ClusterError, match="no worker"), dask_cluster.cluster(empty.scheduler_address)):
         pass
 
 
@@ -208,15 +209,15 @@ def deadly():
 def test_a_killed_process_is_said_and_waited_for_by_nobody(recordings):
     settings = batch.Settings(BENCH, deadly())
     outcomes = list(batch.diagnose_each([str(recordings[0])] * 2, ["", ""], settings, jobs=2))
-    assert [(o.results, batch.KILLED in o.error) for o in outcomes] == [(None, True)] * 2
+    assert [(o.results, dask_cluster.KILLED in o.error) for o in outcomes] == [(None, True)] * 2
 
 
 def test_a_killed_worker_of_a_cluster_is_said_and_the_next_recording_done(recordings, cluster):
-    with batch.cluster(cluster.scheduler_address) as client:
+    with dask_cluster.cluster(cluster.scheduler_address) as client:
         killed = list(batch.diagnose_each([str(recordings[0])], [""], batch.Settings(BENCH, deadly()), client=client))
         next_one = list(batch.diagnose_each([str(recordings[0])], [""], batch.Settings(BENCH, "bench"), client=client))
     assert killed[0].results is None
-    assert batch.KILLED in killed[0].error
+    assert dask_cluster.KILLED in killed[0].error
     assert next_one[0].error == ""
 
 
@@ -263,4 +264,4 @@ def test_an_interrupt_between_two_recordings_ends_the_work_at_once(here, recordi
     (["summary.csv"], ["summary.csv_2"]),
 ])
 def test_folders_have_the_names_of_the_recordings_and_are_all_different(bags, names):
-    assert batch.names(bags) == names
+    assert folder_names(bags, [batch.SUMMARY]) == names

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from aeropend_ident.result_folder import whole
+from aeropend_ident.result_folder import atomic_folder
 
 FILES = ("a.json", "b.html")
 
 
 def write(out, when=None):
-    with whole(out, FILES) as place:
+    with atomic_folder(out, FILES) as place:
         for name in FILES:
             if when == f"{name} is written":
                 signal.raise_signal(signal.SIGINT)

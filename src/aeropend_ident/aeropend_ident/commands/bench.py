@@ -23,7 +23,7 @@ from aeropend_ident.bench_tests import estimates
 from aeropend_ident.bench_tests.estimates import BenchTestError, Estimate, Found, Rows
 from aeropend_ident.bench_tests.picture import scatter
 from aeropend_ident.bench_tests.table import read_rows
-from aeropend_ident.result_folder import check, whole
+from aeropend_ident.result_folder import atomic_folder, ensure_free
 from aeropend_sim.cli.command import Parser, entry_point
 from aeropend_sim.model.parameters import PRESETS, Model, from_flat, load, save
 
@@ -209,14 +209,14 @@ def run(options: argparse.Namespace) -> None:
         BenchTestError, RecordingError, ModelError, OutputError: the input or the output cannot be used.
     """
     out = Path(options.out)
-    check(out, FILES, overwrite=options.overwrite)
+    ensure_free(out, FILES, overwrite=options.overwrite)
     base = load(options.model)
     given = {name: getattr(options, name.replace("-", "_")) for name in TESTS}
     read = {path: source(path, options.columns, options.namespace) for path in set(given.values()) if path}
     found = work_out({name: read[path] for name, path in given.items() if path}, base)
     model = augmented(base, found)
     command = "bench_test " + " ".join(f"--{name} {Path(path).name}" for name, path in given.items() if path)
-    with whole(out, FILES) as place:
+    with atomic_folder(out, FILES) as place:
         save(model, place / FILES[0], provenance(base, found, command))
         body = json.dumps(document(found), indent=1, ensure_ascii=False, allow_nan=False)
         (place / FILES[1]).write_text(body + "\n", encoding="utf-8", errors="backslashreplace")

@@ -21,12 +21,12 @@ from rich.markup import escape
 from rich.table import Table
 
 from aeropend_ident.bags.recording import RecordingError
-from aeropend_ident.diagnosis import batch
+from aeropend_ident.diagnosis import batch, dask_cluster
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.document import Across
 from aeropend_ident.diagnosis.results import FILES, Results, document
 from aeropend_ident.diagnosis.validation import validate
-from aeropend_ident.result_folder import check
+from aeropend_ident.result_folder import ensure_free, folder_names
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_sim.cli.command import Parser, between, entry_point, own
 from aeropend_sim.cli.progress import progress
@@ -36,55 +36,55 @@ from aeropend_sim.untrusted import printable
 EXAMPLES = """examples:
   diagnose my_bag                                compare a recording with the preset 'bench'
   diagnose monday tuesday --model rig.yaml       several recordings of one rig, fitted together
-  diagnose monday --test tuesday                 fit on one recording, show on another how far the gap closes
-  diagnose --each rigs/* --out verdicts          a rig of its own each: one verdict a recording, and a table
+  diagnose monday --test tuesday                 fit one recording, and test on another how far the gap closes
+  diagnose --each rigs/* --out verdicts          recordings of different rigs: a verdict each, and a table
   diagnose --each rigs/* --dask tcp://host:8786  the same on a Dask cluster (pip install 'aeropend_ident[dask]')
-  diagnose let_go --fit-nominal                  a rig whose numbers nobody knows, even without its command
+  diagnose let_go --uncalibrated                 a rig without a model file; a free decay needs no command
   diagnose my_bag --out verdict --jobs 2         choose the folder and the number of threads
-  plant --ros-args --params-file verdict/augmented.yaml      run the model with what was found
+  plant --ros-args --params-file verdict/augmented.yaml      simulate the augmented model
 
 exit codes: 0 a verdict was written, 2 the input cannot be used (one line says why), 130 interrupted"""
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
-    """Read the command line; exits with 2 and one line where it is wrong."""
+    """Read the command line; exits with code 2 and one line if it is wrong."""
     parser = Parser(
         prog="diagnose", epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
-        description="Compare recordings of a rig with its model: where they part, which effect the model is missing, "
-                    "and how far the gap closes once it is added.")
+        description="Compare recordings of a rig with its model: where they differ, which effect the model lacks, and "
+                    "how far the gap closes with that effect.")
     parser.add_argument("bags", nargs="+", metavar="BAG",
-                        help="a recording (folder, .mcap or .db3); several are of one rig, unless --each")
+                        help="a recording (folder, .mcap or .db3); several are of one rig, unless --each is given")
     parser.add_argument("--each", action="store_true",
-                        help="each recording is of a rig of its own: one verdict each in DIR/<name of the bag>, "
+                        help="the recordings are of different rigs: a verdict each in DIR/<name of the bag>, "
                              f"and a table in DIR/{batch.SUMMARY}")
     parser.add_argument("--model", default="bench", metavar="PRESET|FILE",
                         help=f"nominal model: {' or '.join(PRESETS)}, or a model file (default: bench)")
     parser.add_argument("--out", metavar="DIR",
                         help="folder for the results (default: diagnosis_<name of the bag>; with --each: diagnoses)")
-    parser.add_argument("--namespace", metavar="NS", help="namespace of the rig, when a bag holds several")
+    parser.add_argument("--namespace", metavar="NS", help="namespace of the rig, if a bag holds several")
     parser.add_argument("--held-out", type=between(0.05, 0.8, "a share"), default=0.3, metavar="SHARE",
-                        help="share at the end of each recording kept for testing (default: 0.3)")
+                        help="share at the end of each recording that nothing is fitted to (default: 0.3)")
     parser.add_argument("--test", action="append", default=[], metavar="BAG",
-                        help="a further recording of the rig that nothing is fitted to: how far the gap closes there "
-                             "is told as well; may be given several times")
+                        help="a further recording of the rig, on which the gap is measured but nothing is fitted; may "
+                             "be given several times")
     parser.add_argument("--jobs", type=_jobs, metavar="N",
-                        help="threads, or with --each processes (default: one a core); no verdict depends on it")
+                        help="threads, or with --each processes (default: one a core); verdicts do not depend on it")
     parser.add_argument("--dask", metavar="ADDRESS",
-                        help="with --each: let the workers of a Dask cluster do it, whose scheduler is there")
-    parser.add_argument("--fit-nominal", action="store_true",
-                        help="nobody knows the rig: identify its nominal model from the recordings first, as far as "
-                             "they tell; the command may be missing if the arm swings freely")
-    parser.add_argument("--overwrite", action="store_true", help="replace results that are in the folder already")
+                        help="with --each: address of the scheduler of a Dask cluster whose workers diagnose")
+    parser.add_argument("--fit-nominal", "--uncalibrated", action="store_true",
+                        help="the parameters of the rig are not known: identify its nominal model from the recordings "
+                             "first; the command may be missing if the arm swings freely")
+    parser.add_argument("--overwrite", action="store_true", help="replace results in the folder")
     options = parser.parse_args(arguments)
     if options.dask is not None and not options.each:
-        parser.error("--dask spreads recordings of different rigs: give --each with it")
+        parser.error("--dask needs --each: it distributes recordings of different rigs")
     if options.dask is not None and options.jobs is not None:
-        parser.error("--dask takes the workers that the cluster has: leave --jobs away")
+        parser.error("--dask uses all workers of the cluster: leave --jobs out")
     if options.test and options.each:
-        parser.error("--test shows on a recording what others of the same rig said: leave --each away")
+        parser.error("--test needs recordings of one rig: leave --each out")
     for bag in options.test:
         if Path(bag).resolve() in {Path(fitted).resolve() for fitted in options.bags}:
-            parser.error(f"--test {bag}: that recording is fitted to; give it once, before or after --test")
+            parser.error(f"--test {bag}: nothing may be fitted to a test recording; give it once")
     options.jobs = options.jobs or os.cpu_count() or 1
     return options
 
@@ -102,8 +102,8 @@ def run(options: argparse.Namespace, command: str) -> None:
         RecordingError, ModelError, OutputError: the input or the output cannot be used.
     """
     started = time.monotonic()
-    out = Path(options.out or f"diagnosis_{batch.names(options.bags[:1])[0]}")
-    check(out, FILES, overwrite=options.overwrite)
+    out = Path(options.out or f"diagnosis_{folder_names(options.bags[:1], [batch.SUMMARY])[0]}")
+    ensure_free(out, FILES, overwrite=options.overwrite)
     model = load(options.model)
     with progress("reading") as show:
         signals, tests = ([signals_of(bag, options.namespace, model.sensing, options.held_out,
@@ -120,23 +120,24 @@ def run(options: argparse.Namespace, command: str) -> None:
 
 
 def run_each(options: argparse.Namespace) -> None:
-    """Diagnose recordings of a rig each, write what is found as it comes, and a table of it.
+    """Diagnose recordings of different rigs; write each result as it comes, and a table of all.
 
     Raises:
         RecordingError, ModelError, OutputError, ClusterError: none can be diagnosed.
     """
     started = time.monotonic()
     out = Path(options.out or "diagnoses")
-    names = batch.names(options.bags)
-    check(out, (batch.SUMMARY,), overwrite=options.overwrite)
+    names = folder_names(options.bags, [batch.SUMMARY])
+    ensure_free(out, (batch.SUMMARY,), overwrite=options.overwrite)
     for name in names:
-        check(out / name, FILES, overwrite=options.overwrite)
+        ensure_free(out / name, FILES, overwrite=options.overwrite)
     settings = batch.Settings(load(options.model), options.model, options.namespace, options.held_out,
                              options.fit_nominal)
     commands = [_alone(options, bag, out / name) for bag, name in zip(options.bags, names)]
     rows = []
     try:
-        with (batch.cluster(options.dask) as client, progress(f"0 of {len(names)} recordings", len(names)) as show,
+        with (dask_cluster.cluster(options.dask) as client,
+              progress(f"0 of {len(names)} recordings", len(names)) as show,
               closing(batch.diagnose_each(options.bags, commands, settings, options.jobs, client)) as outcomes):
             for name, outcome in zip(names, outcomes):
                 if outcome.results is not None:
@@ -160,14 +161,14 @@ def run_each(options: argparse.Namespace) -> None:
 
 
 def _alone(options: argparse.Namespace, bag: str, out: Path) -> str:
-    """The command that gives the verdict of one of many recordings by itself."""
+    """The command that gives the verdict of one recording of a batch."""
     words = ["diagnose", bag, "--out", str(out), "--model", options.model, "--held-out", f"{options.held_out:g}"]
     words += ["--namespace", options.namespace] if options.namespace is not None else []
     return shlex.join(words + ["--fit-nominal"] * options.fit_nominal)
 
 
 def print_table(rows: Sequence[dict[str, object]]) -> None:
-    """The summary for a person, on standard output; as wide as it needs to be where that is no terminal."""
+    """Print the summary; without a terminal it is as wide as it needs to be."""
     console = Console(highlight=False)
     if not console.is_terminal:
         console = Console(highlight=False, width=10_000)
@@ -186,11 +187,11 @@ def print_table(rows: Sequence[dict[str, object]]) -> None:
 
 
 def _cell(text: object) -> str:
-    """What a name says, not what it would do."""
+    """A cell that rich does not take for markup."""
     return escape(printable(str(text)))
 
 
-@entry_point("diagnose", "interrupted, nothing written")
+@entry_point("diagnose", "interrupted, nothing was written")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
     arguments = own(arguments)

@@ -14,14 +14,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from aeropend_ident.bags import recording
-from aeropend_ident.diagnosis.batch import names
 from aeropend_ident.identification import dataset, picture
 from aeropend_ident.identification.dataset import Dataset
 from aeropend_ident.identification.discrepancy import nominal
 from aeropend_ident.identification.identify import METHODS, Identified, identify_with_traces
 from aeropend_ident.identification.output_error_selection import STABLE
 from aeropend_ident.identification.sindy import DERIVATIVES
-from aeropend_ident.result_folder import check, whole
+from aeropend_ident.result_folder import atomic_folder, ensure_free, folder_names
 from aeropend_sim.cli.command import Parser, between, entry_point
 from aeropend_sim.cli.progress import progress
 from aeropend_sim.model.parameters import PRESETS, load
@@ -123,8 +122,8 @@ def run(options: argparse.Namespace) -> None:
         RecordingError, ModelError, OutputError, TermError: the input or the output cannot be used.
     """
     started = time.monotonic()
-    out = Path(options.out or f"identified_{names([options.bag])[0]}")
-    check(out, FILES, overwrite=options.overwrite)
+    out = Path(options.out or f"identified_{folder_names([options.bag])[0]}")
+    ensure_free(out, FILES, overwrite=options.overwrite)
     model = load(options.model)
     known = nominal(model) if options.method.startswith("discrepancy") else None
     with progress("reading") as show:
@@ -138,7 +137,7 @@ def run(options: argparse.Namespace) -> None:
     drawn = picture.draw(found.method, data.states, late.start or 0, data.period, data.values[late],
                          traces.measured[late], traces.modelled[late],
                          None if traces.free_run is None else traces.free_run[late])
-    with whole(out, FILES) as place:
+    with atomic_folder(out, FILES) as place:
         (place / FILES[0]).write_text(json.dumps(body, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         (place / FILES[1]).write_text(drawn, encoding="utf-8")
     print("\n".join(lines(found)))

@@ -22,7 +22,7 @@ from aeropend_ident.diagnosis.document import (
 )
 from aeropend_ident.diagnosis.report import page
 from aeropend_ident.diagnosis.report.candidates import unit_of
-from aeropend_ident.result_folder import check, whole
+from aeropend_ident.result_folder import atomic_folder, ensure_free
 from aeropend_sim.model.parameters import Model, save
 from aeropend_sim.untrusted import printable
 
@@ -71,8 +71,8 @@ class Results:
         Raises:
             OutputError: the folder cannot be made or written, or holds results already.
         """
-        check(out, FILES, overwrite=overwrite)
-        with whole(out, FILES) as place:
+        ensure_free(out, FILES, overwrite=overwrite)
+        with atomic_folder(out, FILES) as place:
             text = json.dumps(to_json(self.document), indent=1, allow_nan=False) + "\n"
             (place / "diagnosis.json").write_text(text, encoding="utf-8")
             (place / "report.html").write_text(self.page, encoding="utf-8", errors="backslashreplace")
