@@ -10,8 +10,8 @@ from html.parser import HTMLParser
 from itertools import pairwise
 
 import numpy as np
+import one_way_arm
 import pytest
-from evaluation.blind import cases
 
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.document import Curve, UnknownEffect, from_json, to_json
@@ -114,7 +114,7 @@ def two():
 @pytest.fixture(scope="module")
 def strange():
     """Diagnose 24 s of a rig whose arm is braked while it rises only: no effect of the catalogue."""
-    _, columns = cases.draw("rig", "outside", ["one_way_drag"], "table", BENCH.model, BENCH.sensing, 1, 24.0)
+    columns = one_way_arm.recorded_columns(1, 24.0, 1.5)
     return diagnose(BENCH, [from_arrays(columns, SAMPLE_PERIOD, BENCH.sensing)], 2)
 
 
