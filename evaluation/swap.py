@@ -121,7 +121,7 @@ def ratios(plant: Sequence[dict[str, float]], bridge: Sequence[dict[str, float]]
 def record(bag: Path, seconds: float) -> None:
     """Excite the rig of this domain and record it."""
     with Process("record", str(bag), *parameters(while_published="duty_command")) as recorder:
-        recorder.wait_for("joint_states 4")  # what it says of the rates: it listens
+        recorder.wait_for("joint_states 4")  # the line with the rates: it has subscribed
         excite = Process("excite", *parameters(duration=seconds))
         assert excite.wait(seconds + PATIENCE_S) == 0, excite.output
         assert recorder.wait() == 0, recorder.output

@@ -47,7 +47,8 @@ TOLD = {path.name: set(re.findall(r"`(test_\w+)`", path.read_text(encoding="utf-
 
 def links(path):
     """What a document of ours links to here: (path, section), either may be empty."""
-    found = re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]+))?\)", path.read_text(encoding="utf-8"))
+    text = path.read_text(encoding="utf-8")
+    found = re.findall(r"(?:\]\(|^\[[^]]+\]: )([^)#\s]*)(?:#([^)\s]+))?", text, re.MULTILINE)
     return [(target, section) for target, section in found if not target.startswith("http")]
 
 
@@ -109,31 +110,42 @@ def test_files_that_a_document_names_are_there(path):
     assert [name for name in named if not any((base / name).exists() for base in (ROOT, path.parent))] == []
 
 
-def words(path):
-    """The identifiers in a source."""
-    return set(re.findall(r"\w+", path.read_text(encoding="utf-8")))
+def references(text):
+    """The targets of the reference links of a document, by their names."""
+    return dict(re.findall(r"^\[([^]]+)\]: (\S+)$", text, re.MULTILINE))
 
 
-def test_the_method_names_functions_of_the_files_that_it_links_to():
+def defined(path):
+    """The functions, classes, methods and constants that a source defines."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names |= {leaf.id for target in targets for leaf in ast.walk(target) if isinstance(leaf, ast.Name)}
+    return names
+
+
+def test_the_method_links_each_function_to_the_file_that_defines_it():
     method = ROOT / "docs" / "method.md"
-    text = re.sub(r"\s+", " ", method.read_text(encoding="utf-8"))
-    named = re.findall(r"\]\(([^)]+\.py)\)\)?[,:] ((?:`\w+`(?:, )?)+)", text)
-    assert len(named) > 15
-    for target, functions in named:
-        there = words(method.parent / target)
-        assert [name for name in re.findall(r"`(\w+)`", functions) if name not in there] == [], target
-    everywhere = set().union(*(words(method.parent / target) for target, _ in links(method) if target.endswith(".py")))
-    assert [name for name in re.findall(r"`(_?[a-z]+(?:_[a-z]{2,})+)`", text) if name not in everywhere] == []
+    text = method.read_text(encoding="utf-8")
+    target = references(text)
+    named = re.findall(r"\[`(\w+)`\]\[(\w+)\]", text)
+    assert len(named) > 50
+    assert [(name, ref) for name, ref in named if name not in defined(method.parent / target[ref])] == []
+    steps = re.findall(r"^## (\d+\..+?)\n(.+?)(?=^## )", text, re.MULTILINE | re.DOTALL)
+    assert len(steps) == 14
+    assert [heading for heading, body in steps if not re.search(r"\[`\w+`\]\[", body)] == []
 
 
 def test_the_glossary_names_what_is_in_the_files_that_it_links_to():
     glossary = ROOT / "docs" / "glossary.md"
     text = glossary.read_text(encoding="utf-8")
-    target = dict(re.findall(r"^\[([^]]+)\]: (\S+)$", text, re.MULTILINE))
-    assert [path for path in target.values() if not (glossary.parent / path).exists()] == []
+    target = references(text)
     named = re.findall(r"\| \[([^]]+)\], `(\w+)` \|", text)
     assert len(named) > 20
-    assert [(ref, name) for ref, name in named if name not in words(glossary.parent / target[ref])] == []
+    assert [(ref, name) for ref, name in named if name not in defined(glossary.parent / target[ref])] == []
 
 
 def test_no_source_names_a_document_that_is_not_there():

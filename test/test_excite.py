@@ -26,7 +26,7 @@ def test_changes_are_sent_at_once_and_the_rest_is_repeated():
 
 
 def test_it_waits_for_a_listener_and_says_so(start):
-    excite = start("excite").wait_for("nobody listens to /duty_command")
+    excite = start("excite").wait_for("no subscriber to /duty_command")
     assert excite.stop() == 0
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Effects that a poor recording cannot tell apart: both are named, and the experiment advised tells them apart."""
+"""Effects that a poor recording cannot separate: both are named, and the proposed experiment separates them."""
 
 from dataclasses import dataclass, field
 

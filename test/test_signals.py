@@ -9,7 +9,7 @@ import time
 import pytest
 
 BATCH = 5
-READY = {"plant": "effects: none", "excite": "nobody listens"}
+READY = {"plant": "effects: none", "excite": "no subscriber"}
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plant or board: nothing in the graph tells which, and what is started beside it needs no other argument."""
+"""Plant or board: the graph looks the same, and all other nodes start with the same arguments."""
 
 import json
 import math

@@ -113,7 +113,7 @@ def recordings(quick: bool) -> list[Figure]:
 
 
 def effects(quick: bool) -> list[Figure]:
-    """None to all effects of the catalogue considered, three of which are there."""
+    """From none to all effects of the catalogue as hypotheses; three of them are present."""
     order = [*THREE, *(id_ for id_ in CATALOGUE if id_ not in THREE)]
     counts = (0, 1, 6, len(order)) if quick else (0, 1, 6, 12, len(order))
     with tempfile.TemporaryDirectory(prefix="aeropend_bench_") as folder:

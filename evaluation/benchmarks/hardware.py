@@ -60,7 +60,7 @@ class Commander(Listener):
         return np.concatenate(due), sent
 
     def counters(self, process: Process) -> dict[str, str]:
-        """The next counters that the bridge tells."""
+        """The next counters that the bridge publishes."""
         end = time.monotonic() + PATIENCE_S
         handle = self._diagnostics.handle
         with handle:
@@ -73,7 +73,7 @@ class Commander(Listener):
                     if status.name == f"{NAMESPACE[1:]}/bridge":
                         return {value.key: value.value for value in status.values}
                 time.sleep(0.02)
-        raise NotMeasuredError("the bridge tells no counters")
+        raise NotMeasuredError("the bridge publishes no counters")
 
 
 def _latency_ms(sent: list[tuple[int, int]], register: Stamps, written: Stamps) -> tuple[NDArray[np.float64], int]:

@@ -6,11 +6,11 @@ from pathlib import Path
 from evaluation.results import Document, full, on_same, read
 
 WORSE = 0.2
-"""Share by which a ratio must be worse to be told; its quartiles must not touch those of before, either."""
+"""Increase of a ratio that is reported, if its quartiles do not overlap those of the run before either (choice)."""
 
 
 def renewed(folder: Path) -> Document | None:
-    """The latest full run of `make bench` with what was measured again since (`--only`), told in its "again"."""
+    """The latest full run of `make bench` with the sections measured again since (`--only`), listed in its "again"."""
     document = full(folder)
     if document is None:
         return None

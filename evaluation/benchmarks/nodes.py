@@ -109,7 +109,7 @@ class Listener:
 def rhythm(name: str, seconds: float) -> dict[str, float]:
     """Run something that publishes samples, and measure ticks missed, lateness (ms) and CPU (% of a core).
 
-    A program that only sleeps runs beside it, and tells which ticks the machine lets nobody meet.
+    A program that only sleeps runs beside it. It shows which ticks no program could meet on this machine.
     """
     listener = Listener()
     try:

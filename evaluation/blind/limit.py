@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The limit: how often a likelihood ratio test that knows both hypotheses exactly names the right effect.
 
-Two hypotheses whose noise-free readings lie a distance d apart, in standard deviations over all samples, are told apart
+Two hypotheses whose noise-free readings lie a distance d apart, in standard deviations over all samples, are separated
 with probability Φ(d/2). Every other effect is a rival; it may choose the model's numbers within their uncertainty and
 its own parameters freely to imitate the truth. The one that comes closest sets the limit.
 """

@@ -407,7 +407,7 @@ def stepwise_bic(signals: Signals, model: Model | None = None, budget: float = 1
     Args:
         signals: a recording from rest.
         model: nominal; `bench` by default.
-        budget: s after which no further fit begins; `in_time` tells whether it was enough.
+        budget: s after which no further fit begins; `in_time` is false if it was not enough.
     """
     started = time.perf_counter()
     with threadpool_limits(1):

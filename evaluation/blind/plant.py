@@ -60,7 +60,7 @@ States = namedtuple("States", "i omega turned theta rate stage1 stage2 thrust he
 S = States(*range(16))
 
 BRISTLE = 2e-4
-"""rad by which the bristles of the table's dry friction bend: it sticks, and creeps not at all."""
+"""[rad] Deflection of the bristles of the dry friction: it sticks and does not creep."""
 
 
 @njit(cache=True)

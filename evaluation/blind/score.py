@@ -174,7 +174,7 @@ class Figure:
     Attributes:
         value, low, high: None where there was nothing to measure.
         count: number of recordings (or intervals) behind it.
-        at_least, at_most: the target; neither: told, not judged.
+        at_least, at_most: the target; without them the figure is reported only.
     """
 
     name: str
@@ -324,14 +324,14 @@ def scored(pairs: Pairs) -> list[Figure]:
 
 
 def besides(pairs: Pairs) -> list[Figure]:
-    """What is claimed besides the truth; told, not judged."""
+    """Effects claimed besides the true ones; reported without a target."""
     single, two = of_kind(pairs, "single"), of_kind(pairs, "two")
     return [share("single: something claimed besides", [bool(set(a.found) - t.keys) for t, a in single]),
             share("both of two and nothing besides", [both(t, a) and set(a.found) == t.keys for t, a in two])]
 
 
 def figures(pairs: Pairs) -> list[Figure]:
-    """Every figure of the diagnosis, those of the issue's table first, then what is told besides."""
+    """Every figure of the diagnosis, those with targets first, then the figures that are reported only."""
     single, none, two, out = (of_kind(pairs, kind) for kind in KINDS)
     table, other = ([(t, a) for t, a in single if t.form == form] for form in ("table", "other"))
     closed = [(a.closed if a.first != FAILED else 0.0) for _, a in of_kind(pairs, "single", "two")]

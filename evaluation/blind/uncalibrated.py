@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigs whose numbers nobody knows: recordings with the angle and the command alone, and of an arm that swings freely.
+"""The blind check of uncalibrated rigs: recordings of angle and command only, and of an arm that swings freely.
 
-The rigs are those of `plant`, with every number drawn over a factor of three, sampled at 20 to 490 Hz, read to as
-coarse as a degree. An effect is sized by what no refit of the numbers absorbs of the angle.
+The rigs are those of `plant` with every parameter drawn over a factor of three. They are sampled at 20 to 490 Hz, and
+the angle has a resolution of up to a degree. The size of an effect counts what no refit of the parameters absorbs.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ FACTOR = 3.0
 """Largest over smallest value of a number among the rigs."""
 
 EVERY = (1, 5, 10, 24)
-"""Samples of 2.04 ms of which one is kept: 490, 98, 49 and 20 Hz."""
+"""Every how many samples of 2.04 ms one is kept: 490, 98, 49 and 20 Hz."""
 
 STEPS = (math.radians(360.0 / 1024.0), math.radians(0.1), math.radians(1.0))
 """Resolutions of the angle, rad."""
@@ -252,7 +252,7 @@ def figures(labels: Sequence[Mapping[str, Any]], verdicts: Mapping[str, Mapping[
         score.share("the same, first or named with the first", [score.right_named(t, a) for t, a in shown],
                     at_least=0.95),
         score.share("no effect in it, one claimed", [a.claims for _, a in none], at_most=0.05),
-        score.share("free decays: what brakes told rightly", [score.right_first(t, a) if t.keys else a.first == "none"
+        score.share("free decays: right effect or none", [score.right_first(t, a) if t.keys else a.first == "none"
                                                               for t, a in decays], at_least=0.95),
         score.share("right first or none, where a refit leaves less",
                     [score.right_first(t, a) or a.first == "none" for t, a in hidden]),

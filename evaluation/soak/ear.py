@@ -20,7 +20,7 @@ from aeropend_sim.ros import interface
 DEPTH = 20_000
 """Messages that wait in the middleware: 40 s at the sample rate."""
 Info = Mapping[str, int]
-"""What the middleware tells of a message."""
+"""Information of the middleware about a message."""
 _FLOAT64 = struct.Struct("<4xd")
 
 
@@ -53,7 +53,7 @@ class Ear:
 
     Attributes:
         joints, armature, commands: what came.
-        counters: of each node, by its name, as it told them last.
+        counters: the last counters of each node, by its name.
         said: what each node's diagnostics said since `forget_said`.
     """
 

@@ -134,7 +134,7 @@ def stop_controller(stand: Stand) -> None:
 
 @fault("plant")
 def kill_recorder(stand: Stand) -> None:
-    """Its bag opens as it is and ends at most a second early, `recover` makes it whole; nobody else notices."""
+    """Its bag can be read and ends at most a second early, `recover` makes it whole; no other process is affected."""
     since, _ = stand.ear.position()
     killed = stand.send("recorder", signal.SIGKILL)
     stand.nodes["recorder"].wait()
@@ -146,7 +146,7 @@ def kill_recorder(stand: Stand) -> None:
 
 @fault("plant")
 def stop_recorder(stand: Stand) -> None:
-    """What does not wait in the middleware meanwhile is counted as lost; nobody else notices."""
+    """Messages that the middleware cannot hold are counted as lost; no other process is affected."""
     _one_publisher(stand)
     since, _ = stand.ear.position()
     stopped = stand.send("recorder", signal.SIGSTOP)
@@ -216,7 +216,7 @@ def _broken_off(stand: Stand, killed_ns: int | None = None) -> None:
 
 @fault("plant")
 def full_disk(stand: Stand) -> None:
-    """The recorder ends with one line and exit code 2, what it says is safe is in its bag; nobody else notices."""
+    """The recorder ends with one line and exit code 2, its bag has what it reports as saved; no other is affected."""
     since, _ = stand.ear.position()
     recorder = stand.nodes["recorder"]
     size = max(file.stat().st_size for file in stand.bag.iterdir())
@@ -299,7 +299,7 @@ def clock_step(stand: Stand) -> None:
 
 @fault("plant")
 def bad_parameters(stand: Stand) -> None:
-    """A node given a damaged parameter file ends with one line and exit code 2, or runs; nobody else notices."""
+    """A node with a damaged parameter file ends with one line and exit code 2, or runs; no other is affected."""
     since, _ = stand.ear.position()
     folder = stand.bag.parent
     started: list[tuple[bytes, Process]] = []
@@ -348,12 +348,12 @@ def _damaged(stand: Stand, folder: Path) -> bytes:
 
 @fault("plant")
 def two_plants(stand: Stand) -> None:
-    """The controller tells of two publishers, the bag has the samples of both; with one again the loop goes on."""
+    """The controller reports two publishers, the bag has the samples of both; with one again the loop goes on."""
     ear = stand.ear
     ear.forget_said()
     text = f"2 publishers of {interface.JOINT_STATES}"
     with stand.another("plant", "--ros-args") as second:
-        stand.promise("the controller tells of it", lambda: stand.told("controller", text))
+        stand.promise("the controller reports it", lambda: stand.told("controller", text))
         since, _ = stand.ear.position()
         stand.samples(700, "samples of both")
         grids = {stamp % PERIOD_NS for stamp in ear.joints.stamps[since:]}

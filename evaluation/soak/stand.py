@@ -154,7 +154,7 @@ class Stand:
             self._stack = stack.pop_all()
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
-        """End all processes. What a broken promise leaves is told in `promises`, and goes no further."""
+        """End all processes. An error at the end goes into `promises` and is not raised."""
         try:
             self._stack.close()
         except subprocess.TimeoutExpired as late:
@@ -240,14 +240,14 @@ class Stand:
         return any(text in one for one in self.ear.said.get(self._names[role], ()))
 
     def counters(self, role: str) -> dict[str, float]:
-        """The numbers among the counters of a node, as it told them last."""
+        """The numeric counters in the last `/diagnostics` of a node."""
         told = self.ear.counters.get(self._names[role], {})
         return {name: float(value) for name, value in told.items() if value.replace(".", "", 1).isdigit()}
 
     def counted(self, role: str) -> dict[str, float]:
         """The same, as they are now."""
         self.ear.forget_said()
-        self.wait(f"{role} tells its counters", lambda: self.told(role, ""))
+        self.wait(f"{role} publishes its counters", lambda: self.told(role, ""))
         return self.counters(role)
 
     def samples(self, count: int, what: str = "samples go on") -> int:

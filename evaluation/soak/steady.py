@@ -23,10 +23,10 @@ WARM_UP_S = 90.0
 LEAST_S = 120.0
 """Of memory after that from which on its growth is judged."""
 BLOCKS = 12
-"""Blocks of which each gives the fit of memory one point: readings in a row are no independent ones."""
+"""Blocks of the run. Each gives the fit of the memory one point: neighbouring readings are not independent."""
 LATE, AS_LATE = 1e-3, 2.0
-"""Share of samples that the plant may take when the next one is due already; or so many times those of a program that
-only sleeps, on a machine that lets nobody be in time."""
+"""Limits of late samples: their share, and their ratio to the late wake-ups of a program that only sleeps. One of them
+must hold, because on a busy machine every program is late."""
 GROWTH_MIB_H = {"rig": 2.0, "controller": 2.0, "recorder": 10.0, "board": 2.0}
 """MiB/h that may surely be exceeded by none. `record` keeps an index of its bag."""
 

@@ -174,7 +174,7 @@ def check_sampling(program: Path) -> None:
 
 
 def check_duty_told(program: Path) -> None:
-    """Each sample tells the duty that acted while it was taken, whenever in the period the commands came."""
+    """The duty in a sample is the one that acted while it was taken, at whatever time in the period commands came."""
     for scheme in (0, 1):
         bench = Bench(program)
         origin = bench.chip.cycle - 9 * PERIOD_CYCLES // 2  # of the board's time: half a period before the first TOP
@@ -286,7 +286,7 @@ def check_speed(program: Path, captures: int = 6000, seed: int = 1) -> tuple[int
 
 
 def check_watchdog(program: Path) -> None:
-    """A main program that hangs is reset within 100 ms, the duty is 0 from then on, and the host is told."""
+    """A main program that hangs is reset within 100 ms, the duty is 0 from then on, and the host gets a message."""
     bench = Bench(program)
     bench.enable()
     bench.host.duty(0.5)
@@ -305,7 +305,7 @@ def check_watchdog(program: Path) -> None:
 
 
 def check_bad_frames(program: Path) -> None:
-    """A command with a wrong bit in it does nothing, and the host is told; the next one counts."""
+    """A command with a wrong bit in it does nothing, and the host gets a message; the next one counts."""
     random = np.random.default_rng(2)
     bench = Bench(program)
     bench.enable()

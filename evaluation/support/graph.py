@@ -164,8 +164,8 @@ class Graph:
     def shown(self, topic: str) -> dict[str, dict[str, list[TopicEndpointInfo]]] | None:
         """The publishers and the subscriptions, by topic, of the one process that publishes a topic; None: not known.
 
-        Asked by process, not by node: which node an entity belongs to travels in messages of which one may be lost for
-        good when two processes send theirs at once (https://github.com/ros2/rmw_fastrtps/issues/792).
+        The question is by process, not by node: the node of an entity is known from messages, and one of them may be
+        lost for good when two processes send theirs at once (https://github.com/ros2/rmw_fastrtps/issues/792).
         """
         processes = {_process(info) for info in self.node.get_publishers_info_by_topic(topic)}
         if len(processes) != 1:

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.timeout(1200)
 
 @pytest.fixture(scope="module")
 def checked(tmp_path_factory):
-    """Labels and verdicts; nobody can have looked at the labels: they are elsewhere while verdicts are made."""
+    """Labels and verdicts; the labels are in another folder while verdicts are made."""
     out = tmp_path_factory.mktemp("blind")
     check.make(out / "made", COUNT, SEED, DURATION, PROCESSES)
     sealed = out / "made" / check.SEALED
@@ -55,7 +55,7 @@ def test_no_effect_is_claimed_where_there_is_none(pairs):
 
 
 def test_what_is_outside_the_catalogue_is_placed_and_not_always_claimed(pairs):
-    """Of three recordings no rate can be told, and two of these are most like an effect of the catalogue."""
+    """Three recordings give no rate, and two of these resemble an effect of the catalogue most."""
     outside = score.of_kind(pairs, "outside")
     assert all(score.right_place(*pair) for pair in outside)
     assert any(answer.first == "unknown" for _, answer in outside)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The limit of a likelihood test: two names of one thing cannot be told apart, two things can."""
+"""The limit of a likelihood test: two names of one thing cannot be separated, two things can."""
 
 import pytest
 from evaluation.blind.limit import limit

@@ -27,7 +27,7 @@ def label(name: str, kind: str, effects: list[dict], form: str = "table", size: 
 
 
 def verdict(effects: list[dict], first: str | None = None, place: str = "") -> dict:
-    """What a perfect diagnosis says of these effects."""
+    """The verdict of a perfect diagnosis of these effects."""
     candidates = [{"effect": e["effect"], "place": e["place"], "probability": 0.99, "found": True,
                    "parameters": {k: {"value": v, "low": v - 1e-9, "high": v + 1e-9}
                                   for k, v in e["parameters"].items()}, "gap_after": None} for e in effects]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Short recordings, of which free curves follow chance as well: it is told from what depends on the state."""
+"""Short recordings: free curves can follow a random torque too, so it must be separated from a torque of the state."""
 
 import pytest
 from evaluation.blind import cases

@@ -7,10 +7,11 @@ gap, which is counted.
 
 The board sets the duty to 0 if it receives no command for 100 ms. The simulated plant holds the last `duty_command`.
 For the same behaviour, this node repeats the present duty every `REPEAT_S`. The executor repeats it, so the motor stops
-if the node ends, hangs or loses its port. After the port was lost, the board was reset, or the node stood still, the
-duty is 0 until the next command. Commands that were sent while the node stood still do not count.
+if the node ends, hangs or loses its port. After the port was lost, the board was reset, or the node was stopped, the
+duty is 0 until the next command. Commands that were sent while the node was stopped do not count.
 
-One thread reads the port and publishes. The callbacks of the executor send commands, at once or not at all.
+One thread reads the port and publishes. The callbacks of the executor send commands. A command that cannot be written
+at once is dropped.
 """
 
 import math

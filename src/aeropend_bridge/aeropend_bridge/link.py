@@ -103,7 +103,7 @@ class Link:
         return data, now
 
     def write(self, data: bytes) -> bool:
-        """Write a frame at once or not at all; return whether it was written."""
+        """Write a frame if that is possible at once; return whether it was written."""
         with self._lock:
             if self._serial is None:
                 self.dropped += 1

@@ -200,7 +200,7 @@ def parse(payload: bytes) -> Message | None:
     if kind == Type.HELLO and size == _HELLO.size:
         _, version, major, minor, patch, cause, scheme, calibration, build = _HELLO.unpack(payload)
         return Hello(version, (major, minor, patch), cause, scheme, calibration, build)
-    if kind == Type.HELLO and size > 1:  # of another version, of which only the version is known
+    if kind == Type.HELLO and size > 1:  # of another protocol version: the rest of its layout is not known
         return Hello(payload[1], (0, 0, 0), 0, 0, bytes(CALIBRATION_SIZE), 0) if payload[1] != VERSION else None
     if kind == Type.ACK and size == _ACK.size:
         return Ack._make(_ACK.unpack(payload)[1:])

@@ -62,7 +62,7 @@ def test_rows_that_come_in_bursts(rate, rows, apart):
 
 
 def test_bursts_that_are_true_are_kept():
-    """Eight samples 5 ms apart, then a pause of 127 ms, as a loop that stops to print takes them: the angle tells."""
+    """Eight samples 5 ms apart, then a pause of 127 ms, as of a loop that stops to print: the angle shows it."""
     true = np.concatenate([start + 0.005 * np.arange(8) for start in 0.1625 * np.arange(90)])
     error, found = off(true, np.round(true, 3))
     assert error < 1e-3

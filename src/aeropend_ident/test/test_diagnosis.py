@@ -85,7 +85,7 @@ def test_effects_all_over_the_chain_are_found_and_nothing_else():
 
 
 def far_off(number, factor):
-    """The document of a rig of which one number is off by a factor."""
+    """The document of a rig with one parameter off by a factor."""
     model = drawn_rig(80, {})
     model = Model("rig", {**model.model, number: factor * BENCH.model[number]}, model.sensing)
     duty = steps(40.0, 80)

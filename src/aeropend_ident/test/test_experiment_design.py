@@ -44,7 +44,7 @@ def test_what_is_the_same_in_every_equation_is_to_be_measured_directly(signals, 
 
 
 def test_what_numbers_within_their_uncertainty_can_take_over_is_no_difference(signals):
-    """Readings that are far apart, by numbers alone: no signal tells one from the other."""
+    """Readings that differ by parameters only: no signal separates the hypotheses."""
     friction = hypothesis(coulomb_friction__accel=0.4)
     shifted = {**friction, "k_thrust": 1.02 * friction["k_thrust"], "R_a": 0.98 * friction["R_a"]}
     a, b = (free_run(BENCH, signals, values)["theta"] for values in (friction, shifted))

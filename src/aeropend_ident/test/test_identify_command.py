@@ -41,7 +41,7 @@ def bag(made):
 
 @pytest.fixture(scope="module")
 def identified(bag, tmp_path_factory):
-    """What the command says of it, and its folder."""
+    """Output of the command, and its folder."""
     out = tmp_path_factory.mktemp("identified") / "out"
     result = run(bag, "--method", "weak", "--out", out)
     assert result.returncode == 0, result.stderr

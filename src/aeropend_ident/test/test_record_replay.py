@@ -135,7 +135,7 @@ def samples(recording, start, count):
 
 
 class Told:
-    """A subscription of which each message is only its number."""
+    """A subscription whose messages are only counted."""
 
     def __init__(self, numbers):
         self.handle, self.numbers = self, list(numbers)

@@ -127,7 +127,7 @@ class Excite(Node):
         topic = self._publisher.topic_name
         return self._wait(
             lambda: self._publisher.get_subscription_count() > 0,
-            f"nobody listens to {topic} yet: waiting for a plant or a bridge",
+            f"no subscriber to {topic} yet: waiting for a plant or a bridge",
             end,
         )
 

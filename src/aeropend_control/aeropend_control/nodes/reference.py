@@ -58,7 +58,7 @@ class Reference(Node):
             nonlocal reported
             if not reported and time.monotonic() > start + NEWS_S:
                 reported = True
-                self.get_logger().info(f"nobody listens to {self._publisher.topic_name} yet: waiting for a controller")
+                self.get_logger().info(f"no subscriber to {self._publisher.topic_name} yet: waiting for a controller")
             return bool(self._publisher.get_subscription_count())
 
         if wait_until(has_subscriber, end):

@@ -137,7 +137,7 @@ class StepTest(Node):
         if not (self._wait(lambda: self._joints, f"no {interface.JOINT_STATES} yet: waiting for a plant or a bridge",
                            end)
                 and self._wait(self._publisher.get_subscription_count,
-                               f"nobody listens to {self._publisher.topic_name} yet: waiting for a controller", end)):
+                               f"no subscriber to {self._publisher.topic_name} yet: waiting for a controller", end)):
             return
         known = self._known_laws
         give_up = time.monotonic() + NAMES_S  # a node's name may be known later than its subscription

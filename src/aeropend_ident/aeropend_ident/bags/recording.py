@@ -79,7 +79,7 @@ class Recording:
         i_a: (N,) armature current, A.
         v_a: (N,) armature voltage, V.
         duty: (N,) duty applied, 0..1.
-        channels: those of theta, omega, i_a, v_a, duty that hold a number at all.
+        channels: those of theta, omega, i_a, v_a, duty that contain a number.
         period: sample period estimated from the stamps, s; NaN for a single sample.
         gaps: (M, 2) for every gap the index of the sample before it and the number of samples that are missing.
         duplicates: messages whose stamp had been there before (the first one counts).

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The main job from end to end: a plant with a hidden effect, a recording of it, and what `diagnose` makes of that.
+"""The main job from end to end: a plant with a hidden effect, a recording of it, and its diagnosis.
 
-The plant, the excitation, the recorder and the diagnosis are processes of their own. What the plant is given is drawn
-at random and written to a file that the plant alone is told of.
+The plant, the excitation, the recorder and the diagnosis are separate processes. The hidden effect is drawn at random
+and written to a file that only the plant reads.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except OSError as error:
         raise DemoError(f"{folder}: {error.strerror}; give a new folder with --out") from None
     drawn, rig = draw(options.effect, options.seed)
-    save(rig, folder / "rig.yaml", "the rig of the demo: what diagnose is not told")
+    save(rig, folder / "rig.yaml", "the rig of the demo, hidden from diagnose")
     seed = options.seed if options.seed is not None else int(np.random.default_rng().integers(1000))
     print(f"A rig whose flaw is hidden runs for {options.duration:g} s and is recorded; results go to {folder}")
     bag = measure(folder, folder / "rig.yaml", options.duration, seed, console)

@@ -65,7 +65,7 @@ def recover(path: Path | str, out: Path | str | None = None, show: Show = nothin
     Args:
         path: the broken bag; it is not changed.
         out: folder to make; PATH_recovered when left out.
-        show: is told which share of the messages is written.
+        show: called with the share of the messages that is written.
 
     Raises:
         RecordingError: nothing can be recovered, `out` exists, or it cannot be written; nothing is left behind.

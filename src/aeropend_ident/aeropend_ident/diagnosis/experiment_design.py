@@ -73,7 +73,7 @@ Distance = tuple[float, str]
 
 
 def experiments_within(top: float) -> tuple[Excitation, ...]:
-    """One signal of each kind for a rig of which only the largest duty so far is known.
+    """One signal of each kind for a rig if only the largest duty so far is known.
 
     Args:
         top: largest duty that the rig has been given.

@@ -56,7 +56,7 @@ Choice; any factors from 0.1 and 10 on lead to the same minimum."""
 ENOUGH, ENOUGH_OF_EXCESS = 1e-2, 1e-4
 """Decrease of the cost below which the search stops: absolute, and relative to the cost above that of noise.
 
-Choice: the cost is twice a log density, and 0.01 is a hundredth of what tells two hypotheses apart."""
+Choice: the cost is twice a log density, and a difference of 1 hardly decides between two hypotheses."""
 
 
 @dataclass(frozen=True)
@@ -175,7 +175,7 @@ class Search:
     def jacobian(self, step: float = STEP) -> dict[str, Sensitivities]:
         """Derivatives of the weighted residuals, by finite differences towards the inside of the bounds.
 
-        A parameter of which each recording has its own is moved in all recordings at once.
+        A parameter that each recording has a value of its own for is moved in all recordings at once.
         """
         moves = np.where(self.z + step > self.high, -step, step)
         groups: dict[str, dict[int, int]] = {}

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Data of sparse identification: states and inputs on a grid, and the readings that show them.
 
-The rig's angle is read through a filter, its speed as the time between pulses, and its angular rate is not read at all.
+The rig measures its angle through a filter and its speed as the time between pulses, and no angular rate.
 The regression uses the best description of the states that the readings allow. The free runs go through the same filter
 and count the same pulses: the states of the measurement chain run with them.
 """

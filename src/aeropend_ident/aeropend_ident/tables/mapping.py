@@ -181,7 +181,7 @@ def _doubts(table: Table, chosen: dict[str, tuple[int, Unit]], channels: dict[st
     if rate > FAST:
         notes.append(f"{rate:.4g} rows a second: is the unit of the time right?")
     if rate < SLOW:
-        notes.append(f"{rate:.3g} rows a second are few: below {SLOW:g} not much can be told from a recording")
+        notes.append(f"{rate:.3g} rows a second are few: with less than {SLOW:g} little of the dynamics shows")
     if "theta" in channels and np.nanmax(np.abs(channels["theta"])) > FAR:
         notes.append("theta goes round more than twice: are its unit and its zero right?")
     for name, (k, unit) in chosen.items():

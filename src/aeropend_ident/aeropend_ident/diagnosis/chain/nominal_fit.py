@@ -5,10 +5,10 @@ The channels decide which parameters are free:
 
 - Angle alone, of an arm that swings freely: gravity, viscous damping and the zero of the angle. The search starts from
   the turning points.
-- Angle and command: a static curve from duty to lift, with a dead zone and a curvature, behind one lag. It is
-  expressed by the model file's own map and motor, of which as many parameters are free as the angle can determine. The
-  search starts from a linear regression of the weak form: the equation of motion times a test function, integrated by
-  parts, so that no reading is differentiated. One regression is made for each of some curves and lags.
+- Angle and command: a static curve from duty to lift, with a dead zone and a curvature, behind one lag. The map
+  and the motor of the model file express it; only the parameters that the angle can determine are free. The search
+  starts from a linear regression of the weak form: the equation of motion times a test function, integrated by parts,
+  so that no reading is differentiated. There is one regression for each curve and lag of a grid.
 - Speed, current or voltage too: every parameter of the model file, stage by stage.
 
 Then the readings are fitted, first over the beginning of the recordings, then over growing horizons.

@@ -21,7 +21,7 @@ AGAINST = ("theta", "theta_dot", "omega", "i_a", "duty", "t")
 """The variables that errors are drawn against: those of the regions."""
 
 BINS = 24
-"""Bins of a picture at most (choice: about as many as can be told apart in a picture of this width)."""
+"""Bins of a picture at most (choice: about as many as the eye can separate in a picture of this width)."""
 
 SAMPLES_PER_BIN = 40
 """Samples for one bin in a short recording: both outer 5 % quantiles then have two samples beyond them (choice)."""

@@ -207,11 +207,11 @@ class SelectionRound:
                 - sum(of(self.downstream[b], ess) for b in self.acts_on[h.name] if b != self.stage) for h, f in tried]
 
     def _ranked_by_place(self, ranked: list[RankedHypothesis]) -> list[RankedHypothesis]:
-        """Decide between close rivals at different places of which none explains all.
+        """Decide between close rivals at different places if none of them explains the whole misfit.
 
         The true effect then has another form than the catalogue's. Each rival is given free curves at its own place.
-        The right one needs them for its form alone; a wrong one cannot mend from its place what arises at another. The
-        probability that the close rivals have together is shared by the likelihood with free curves.
+        The right one needs them for its form only. A wrong one cannot correct, from its place, an error that arises
+        elsewhere. The likelihoods with free curves divide the total probability of the close rivals.
         """
         best = mean_square(ranked[0].fit, self.stage)
         close = [r for r in ranked[:CONTENDERS] if r.gain > 0.0 and mean_square(r.fit, self.stage) < CLOSE * best]
