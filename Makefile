@@ -19,7 +19,7 @@ ifneq ($(CURDIR)$(PYTHON),$(shell cat .venv/.tree 2>/dev/null))
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test bench blind sensitivity soak coverage lint clean distclean
+.PHONY: help demo test bench blind sensitivity regression soak coverage lint clean distclean
 
 help: ## show this
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile | expand -t 20
@@ -47,6 +47,9 @@ blind: .venv/.dev ## diagnose recordings of withheld effects, then open their la
 
 sensitivity: .venv/.dev ## diagnose with each decision threshold at 70 and 130 % (ARGS="--minutes 20"; ARGS=--docs)
 	$(BIN)/python -m evaluation.sensitivity $(ARGS)
+
+regression: .venv/.dev ## compare the results of this tree with those of another (ARGS="--help")
+	$(BIN)/python -m evaluation.regression $(ARGS)
 
 soak: .venv/.runtime ## run a loop for 30 minutes under load, then with faults (ARGS="--minutes 5 --seed 3")
 	tools/setup firmware

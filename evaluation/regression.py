@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a change of the code changed a result: compare what two trees make of the same recordings.
+"""Compare the results of two trees for the same recordings: which numbers did a change of the code change?
 
     python -m evaluation.regression inputs FOLDER            make the recordings (once)
     python -m evaluation.regression run FOLDER NAME          results of this tree, in FOLDER/NAME

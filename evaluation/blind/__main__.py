@@ -3,7 +3,8 @@
 
     make blind                            312 recordings of 70 s: about an hour on two cores, 2.5 GB
     make blind ARGS="--count 60 --seed 7"
-    make blind ARGS="--uncalibrated --count 120" uncalibrated rigs
+    make blind ARGS="--uncalibrated --count 120"    uncalibrated rigs
+    make blind ARGS=--docs                          the table of the last run goes into docs/results/blind.md
 
 Steps can be run alone: --steps make,diagnose,peers,score. The labels stay sealed until every verdict is written.
 """
@@ -29,7 +30,7 @@ from aeropend_ident.diagnosis.results import document
 from aeropend_ident.signals.from_bag import from_recording
 from aeropend_ident.testing import bags
 from aeropend_sim.model.parameters import load
-from evaluation.blind import cases, limit, peers, plant, report, uncalibrated
+from evaluation.blind import cases, limit, page, peers, plant, report, uncalibrated
 
 MODEL = "bench"
 SEALED = "labels.sealed"
@@ -153,7 +154,10 @@ def _uncalibrated_rigs(options: argparse.Namespace, steps: list[str]) -> None:
     if "diagnose" in steps:
         uncalibrated.diagnose_all(out, options.jobs)
     if "score" in steps:
-        uncalibrated.report(out)
+        found = uncalibrated.report(out)
+        conditions = page.conditions(options.count, options.seed)
+        document = {"conditions": conditions, "figures": [f.document() for f in found]}
+        (out / "results.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 
 
 def main() -> None:
@@ -169,8 +173,14 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=[], help="diagnose only these recordings")
     parser.add_argument("--uncalibrated", "--unknown", action="store_true",
                         help="uncalibrated rigs: angle and command alone, and free decays")
+    parser.add_argument("--docs", action="store_true",
+                        help="run nothing, write the table of the last run into docs/results")
     options = parser.parse_args()
     steps = options.steps.split(",")
+    if options.docs:
+        page.write(options.out / "unknown" if options.uncalibrated else options.out,
+                   "uncalibrated" if options.uncalibrated else "blind")
+        return
     if options.uncalibrated:
         _uncalibrated_rigs(options, steps)
         return
@@ -186,7 +196,8 @@ def main() -> None:
         asked = options.out / "peers.json"
         answers = json.loads(asked.read_text()) if asked.exists() else {}
         known = limits(options.out, labels, options.jobs) if answers else None
-        report.report(labels, verdicts, answers, options.out, known)
+        report.report(labels, verdicts, answers, options.out, known,
+                      conditions=page.conditions(len(verdicts), options.seed))
 
 
 if __name__ == "__main__":

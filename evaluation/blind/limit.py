@@ -196,11 +196,9 @@ class Readings:
     def of(self, model: Model) -> Array:
         """All channels as one vector (M,)."""
         run = dynamics.simulate(model, self.duty)
-        e = model.effects
         theta = sensing.angle_reading(run.theta, run.theta_dot, sensing.prepare(model))
-        i_a = (run.i_a * (1.0 + e.get("current_gain", {}).get("gain", 0.0))
-               + e.get("current_offset", {}).get("bias", 0.0))
-        v_a = run.v_a + e.get("voltage_offset", {}).get("bias", 0.0)
+        i_a = sensing.read_current(model, run.i_a)
+        v_a = sensing.read_voltage(model, run.v_a)
         speed = mean_speed(run.rotor_angle, self.end, self.length, SAMPLE_PERIOD)
         weight = math.sqrt(THIN)
         vector = np.concatenate([weight / self.sigma["theta"] * theta[::THIN], weight / self.sigma["i_a"] * i_a[::THIN],

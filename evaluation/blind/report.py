@@ -13,7 +13,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from evaluation.blind import pictures
+from evaluation.blind import page, pictures
 from evaluation.blind.score import (
     KINDS,
     Answer,
@@ -47,7 +47,8 @@ WIDTH = 116
 
 def report(labels: Sequence[Mapping[str, Any]], verdicts: Mapping[str, Mapping[str, Any]],
            peers: Mapping[str, Mapping[str, Mapping[str, Any]]], out: Path,
-           limits: Mapping[str, Mapping[str, Any]] | None = None, console: Console | None = None) -> dict[str, Any]:
+           limits: Mapping[str, Mapping[str, Any]] | None = None, console: Console | None = None,
+           conditions: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Score everything, print the tables, and write results.json, confusion.png, size.png, calibration.png.
 
     Args:
@@ -58,6 +59,7 @@ def report(labels: Sequence[Mapping[str, Any]], verdicts: Mapping[str, Mapping[s
         out: folder, made if it is not there.
         limits: recording -> what `limit.limit` says.
         console: where the tables go.
+        conditions: of the run, as `page.conditions` gives them.
 
     Returns:
         The content of results.json; `passed` says whether every target is met.
@@ -92,9 +94,10 @@ def report(labels: Sequence[Mapping[str, Any]], verdicts: Mapping[str, Mapping[s
     pictures.draw_sizes(sizes, out / "size.png")
     pictures.draw_calibration(stated, out / "calibration.png")
     results = {
+        "conditions": conditions,
         "recordings": {kind: len(of_kind(pairs, kind)) for kind in KINDS},
         "passed": all(f.met for f in all_ if f.judged),
-        "figures": [asdict(f) | {"met": f.met if f.judged else None} for f in all_],
+        "figures": [f.document() for f in all_],
         "effects": {k: dict(zip(("right_first", "named", "right_place"), map(asdict, v))) for k, v in effects.items()},
         "peers": {name: {"recordings": len(theirs), "figures": [asdict(f) for f in _peer_figures(theirs)],
                          "diagnose": [asdict(f) for f in _peer_figures(ours)]}
@@ -123,24 +126,15 @@ def _peer_figures(pairs: Pairs) -> list[Figure]:
 
 
 def _text(f: Figure) -> str:
-    if f.value is None:
-        return "-"
-    return f"{100.0 * f.value:.1f} %" if f.share else f"{f.value:.3g}"
+    return page.value(asdict(f))
 
 
 def _interval_text(f: Figure) -> str:
-    if f.low is None or f.high is None:
-        return ""
-    return f"{100.0 * f.low:.1f} to {100.0 * f.high:.1f}" if f.share else f"{f.low:.3g} to {f.high:.3g}"
+    return page.interval(asdict(f))
 
 
 def _target_text(f: Figure) -> str:
-    scale, unit = (100.0, " %") if f.share else (1.0, "")
-    if f.at_least is not None and f.at_most is not None:
-        return f"{scale * f.at_least:g} to {scale * f.at_most:g}{unit}"
-    if f.at_least is not None:
-        return f"at least {scale * f.at_least:g}{unit}"
-    return f"at most {scale * f.at_most:g}{unit}" if f.at_most is not None else ""
+    return page.target(asdict(f))
 
 
 def _verdict_text(f: Figure) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -196,6 +196,10 @@ class Figure:
         """Whether the value meets the target; nothing measured does not."""
         return (self.value is not None and (self.at_least is None or self.value >= self.at_least)
                 and (self.at_most is None or self.value <= self.at_most))
+
+    def document(self) -> dict[str, Any]:
+        """The figure as JSON; "met" is null without a target."""
+        return asdict(self) | {"met": self.met if self.judged else None}
 
 
 def wilson(hits: int, total: int) -> tuple[float, float]:

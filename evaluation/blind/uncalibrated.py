@@ -238,7 +238,7 @@ def left(body: Mapping[str, Any] | None) -> float:
 
 
 def figures(labels: Sequence[Mapping[str, Any]], verdicts: Mapping[str, Mapping[str, Any]]) -> list[score.Figure]:
-    """The figures of unknown rigs."""
+    """The figures of uncalibrated rigs."""
     what = {label["name"]: label["what"] for label in labels}
     pairs = score.pair(labels, verdicts, score.answer_of_diagnosis)
     driven_, decays = ([(t, a) for t, a in pairs if what[t.name] == w] for w in ("driven", "decay"))
