@@ -196,7 +196,7 @@ def test_beyond_the_angle_limit_the_arm_is_let_down_until_the_next_reference(gra
         set_parameters(graph, angle_limit=1.4)
 
 
-@pytest.mark.promise("Control", "Without samples for 50 ms the duty is 0, and the law starts anew with the next sample")
+@pytest.mark.promise("Control", "Without samples for 50 ms the duty is 0, and the law restarts with the next sample")
 def test_a_plant_that_stands_still_gets_duty_0(loop, running):
     logged = running.controller.output.count("no sample for 0.05 s")
     running.plant.send(signal.SIGSTOP)
@@ -343,7 +343,7 @@ def test_nan_gives_duty_0_at_once_and_halves_may_come_in_any_order(graph, by_han
     assert by_hand.controller.output.count("NaN") == 1
 
 
-@pytest.mark.promise("Control", "Without samples for 50 ms the duty is 0, and the law starts anew with the next sample")
+@pytest.mark.promise("Control", "Without samples for 50 ms the duty is 0, and the law restarts with the next sample")
 def test_silence_gives_duty_0(graph, by_hand):
     by_hand.works(0.1)
     graph.until(lambda: by_hand.duty[-1].data == 0.0, "duty 0")

@@ -86,7 +86,7 @@ def c_series(model: Model, *flags: str, inner: int = 1) -> Callable[[], Array]:
 
 
 def reference(model: Model) -> dict[str, Array]:
-    """The states at the samples by scipy's DOP853 at 1e-10, started anew wherever the duty changes."""
+    """The states at the samples by scipy's DOP853 at 1e-10, restarted wherever the duty changes."""
     n, series = model.numbers(), duty()
     v = actuator.voltage(n, series)
     edges = [0, *np.flatnonzero(np.diff(series)) + 1, len(series)]

@@ -31,7 +31,7 @@ def new_constant(threshold: Threshold, value: float) -> Any:
 
 @contextmanager
 def changed(module: str, name: str, value: Any) -> Iterator[list[Binding]]:
-    """Give a constant another value wherever it is bound, for the time of a block; yields what was bound anew."""
+    """Give a constant another value wherever it is bound, for the time of a block; yields the changed names."""
     undo: list[Binding] = []
     try:
         _bind(sys.modules[module], name, value, undo)

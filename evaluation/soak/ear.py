@@ -91,7 +91,7 @@ class Ear:
         return len(self.joints), len(self.armature)
 
     def forget_said(self) -> None:
-        """From now on only what is said anew counts."""
+        """From now on only new messages count."""
         self.drain()
         self.said.clear()
         self.counters.clear()

@@ -31,7 +31,7 @@ STEP_S = 7.0
 LATE_NS = 50_000_000
 """Age of a sample that comes at once, on a machine that has other things to do."""
 SILENT_NS = 300_000_000
-"""The least for which a bridge that has lost its board says nothing: its clock must settle anew."""
+"""The least for which a bridge that has lost its board is silent: its clock must settle again."""
 SAFE_NS = 1_000_000_000
 """What a recorder that is killed has had for longer is on disk."""
 ROOM = 150_000
@@ -244,7 +244,7 @@ def unplug(stand: Stand) -> None:
 
 @fault("bridge")
 def reset_board(stand: Stand) -> None:
-    """The board's clock starts anew, the ROS stamps go on; samples come within a second, with duty 0."""
+    """The board's clock restarts, the ROS stamps go on; samples come within a second, with duty 0."""
     _board(stand, "reset", "board resets", 0.0)
 
 

@@ -237,7 +237,7 @@ class Bridge(RigInterface):
                 periods = round((board_ns - self._last_time) / (protocol.SAMPLE_TICKS * protocol.TICK_NS))
                 if periods <= 0 or (clock.settled and clock.early_ns(board_ns, arrival_ns) > CLOCK_STEP_NS):
                     counts.board_resets += 1  # and its HELLO was lost
-                    self.get_logger().warn("the board's clock started anew: duty 0 until the next command")
+                    self.get_logger().warn("the board's clock restarted: duty 0 until the next command")
                     self._forget_board()
                     return
                 counts.lost_samples += periods - 1

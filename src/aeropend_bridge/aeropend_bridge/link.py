@@ -63,7 +63,7 @@ class Link:
         if "exclusively lock" in text:
             return f"{self.port} is in use by another program: end it"
         if "Permission denied" in text:
-            return f"{self.port} may not be opened: join its group (sudo usermod -aG dialout $USER) and log in anew"
+            return f"{self.port} may not be opened: join its group (sudo usermod -aG dialout $USER) and log in again"
         return f"{self.port} cannot be opened: {getattr(error, 'strerror', None) or text}"
 
     def close(self) -> None:

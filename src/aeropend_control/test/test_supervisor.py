@@ -125,7 +125,7 @@ def test_it_goes_on_from_the_duty_that_the_rig_held_meanwhile(loop):
     assert loop.law.since == 0.2
 
 
-@pytest.mark.promise("Control", "Without samples for 50 ms the duty is 0, and the law starts anew with the next sample")
+@pytest.mark.promise("Control", "Without samples for 50 ms the duty is 0, and the law restarts with the next sample")
 def test_silence_means_duty_0_and_a_new_start(loop):
     loop.samples(5)
     loop.supervisor.on_timeout()
@@ -142,7 +142,7 @@ def test_nan_means_duty_0_and_the_law_bridges_a_short_one(loop):
     assert "theta of a sample is NaN" in loop.supervisor.fault
     assert loop.sample() == 0.06
     assert loop.samples(30, theta=math.nan) == [0.0] * 30
-    assert loop.sample() == 0.01  # it started anew
+    assert loop.sample() == 0.01  # it restarted
     assert loop.supervisor.counts["unusable"] == 2
 
 

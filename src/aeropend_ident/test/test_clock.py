@@ -123,7 +123,7 @@ def test_clocks_that_start_anew(stamps, options):
     true = np.arange(1000) / 50.0
     error, found = off(true, stamps(true), **options)
     assert error < 1e-6
-    assert "starts anew once" in found.notes[0]
+    assert "restarts once" in found.notes[0]
 
 
 @pytest.mark.promise(

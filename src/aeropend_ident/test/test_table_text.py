@@ -77,7 +77,7 @@ def test_a_last_line_that_is_broken_off_is_told(tmp_path, capsys):
 
 UNREADABLE = {
     "t,x\n" + NUMBERS + "4.0,1.2.3\n4.1,0\n": "line 202, column 2 (x): '1.2.3' is not a number",
-    "t,x\n" + NUMBERS + "4.0,hello\n4.1,0\n": "'hello' is not a number; mend it, or give --skip-bad",
+    "t,x\n" + NUMBERS + "4.0,hello\n4.1,0\n": "'hello' is not a number; correct it, or give --skip-bad",
     "t,x\n" + NUMBERS + "4.0,1,2\n4.1,0\n": "line 202 has 3 cells, the others have 2",
     "t;x\n" + comma(lines(TIME, ANGLE, split=";")) + "4,0;1.5\n4,1;0\n": "'1.5' has a decimal point, where others have",
     "t;x\n" + comma(lines(TIME, ANGLE, split=";")) + "4,0;1.234,5\n4,1;0\n": "'1.234,5' marks thousands",

@@ -14,7 +14,7 @@ likelihood plus log Occam factor, the prior density times the posterior volume (
 Inference, and Learning Algorithms, 2003, chapter 28).
 
 The steps are Levenberg-Marquardt's. `scipy.optimize.least_squares` with the same residuals, Jacobian and weights ends
-at the same cost and takes 2.5 to 3 times the CPU time (`make bench ARGS="--only optimiser"`): it starts anew whenever
+at the same cost and takes 2.5 to 3 times the CPU time (`make bench ARGS="--only optimiser"`): it restarts whenever
 the weights are renewed, and solves for the bounds more exactly than is needed here.
 """
 

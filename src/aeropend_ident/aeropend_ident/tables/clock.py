@@ -158,7 +158,7 @@ def date(time: Floats, angle: Floats, lines: Ints, *, is_clock: bool = False, ti
         raise ClockError(f"{counted(len(rows), 'row')} with a time: too few for a recording")
     t, n = _unwrapped(time[rows], is_clock, tick)
     if n:
-        notes.append(f"the clock starts anew {n if n > 1 else 'once'}{' times' if n > 1 else ''}: counted on")
+        notes.append(f"the clock restarts {n if n > 1 else 'once'}{' times' if n > 1 else ''}: counted on")
     if repeats is not None:
         t, rows = _without_repeats(t, rows, repeats, notes)
     t, rows = _sorted(t, rows, notes)
@@ -216,7 +216,7 @@ def _dated(t: Floats, rows: Ints, angle: Floats, lines: Ints, lengths: Ints | No
     return _on(even, t, rows, lines, notes)
 
 
-# Stamps that start anew, repeat, or are out of order
+# Stamps that restart, repeat, or are out of order
 
 
 def _unwrapped(t: Floats, is_clock: bool, tick: float) -> tuple[Floats, int]:

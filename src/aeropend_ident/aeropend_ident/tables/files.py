@@ -89,7 +89,7 @@ def _kind(path: Path) -> str:
             with zipfile.ZipFile(path) as archive:
                 names = archive.namelist()
         except (zipfile.BadZipFile, NotImplementedError, ValueError):
-            raise TableError(f"{path}: is a damaged ZIP file: copy it again, or save it anew") from None
+            raise TableError(f"{path}: is a damaged ZIP file: copy it again, or save it again") from None
         if any(name.startswith("xl/") for name in names):
             return "xlsx"
         if names and all(name.endswith(".npy") for name in names):
@@ -134,7 +134,7 @@ def _workbook(path: Path, sheet: str | None) -> Table:
         raise
     except Exception as error:  # whatever is in the file, openpyxl raises what its parsers raise
         why = " ".join(str(error).split())[:100] or type(error).__name__
-        raise TableError(f"{path}: cannot be read as a workbook ({why}): save it anew, or as .csv") from None
+        raise TableError(f"{path}: cannot be read as a workbook ({why}): save it again, or as .csv") from None
 
 
 def _sheet(path: Path, book: Any, wanted: str | None) -> Table:
@@ -304,7 +304,7 @@ def _matlab(path: Path) -> Arrays:
     if child.returncode == 2:
         raise TableError(child.stderr.decode(errors="replace").strip().splitlines()[-1].replace(full, str(path), 1))
     if child.returncode:
-        raise TableError(f"{path}: cannot be read as a MATLAB file: it is damaged; save it anew with save(..., '-v7')")
+        raise TableError(f"{path}: cannot be read as a MATLAB file: it is damaged; save it again with save(..., '-v7')")
     with np.load(io.BytesIO(child.stdout), allow_pickle=False) as found:
         names = json.loads(found["names"].tobytes())
         return {name: found[f"a{k}"] for k, name in enumerate(names)}

@@ -273,7 +273,7 @@ def _readable_rows(table: Table, used: list[int], plan: Plan, notes: list[str]) 
         return np.arange(len(table))
     text = any(column.is_text for column in columns)
     if not plan.skip_bad or text:
-        raise TableError(min(complaints)[1] + "; mend it, or give --skip-bad to leave such rows out" * (not text))
+        raise TableError(min(complaints)[1] + "; correct it, or give --skip-bad to leave such rows out" * (not text))
     bad = np.unique(np.concatenate([table.bad, *(table.columns[k].bad for k in used)]))
     notes.append(f"{counted(len(bad), 'row')} that cannot be read left out, first: "
                  f"{min(complaints)[1].removeprefix(f'{table.path}: ')}")

@@ -65,7 +65,7 @@ def _mat(path: Path) -> Arrays:
         raise
     except Exception as error:  # whatever is in the file, scipy raises what its parsers raise
         why = " ".join(str(error).split())[:80]
-        raise TableError(f"{path}: cannot be read as a MATLAB file ({why}): save it anew with save(..., '-v7')"
+        raise TableError(f"{path}: cannot be read as a MATLAB file ({why}): save it again with save(..., '-v7')"
                          ) from None
     return dict(_flat({k: v for k, v in variables.items() if not k.startswith("__")}))
 

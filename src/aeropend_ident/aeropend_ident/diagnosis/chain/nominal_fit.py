@@ -125,7 +125,7 @@ def fit_nominal_model(model: Model, recordings: Sequence[Signals]) -> tuple[Mode
         noisier = [_with_local_noise(chain, chains.values_of(f.values, k)) for k, chain in enumerate(chains.each)]
         return replace(found, name=name), noisier
     if angle_only(recordings):
-        coarse = [_coarser(s) for s in recordings]
+        coarse = [_downsampled(s) for s in recordings]
         begun = [_over_growing_horizons(m, coarse) for m in _starts_of_driven(model, coarse)]
         ess = largest_ess(f for _, f in begun)
         best = max(begun, key=lambda b: b[1].log_evidence(ess))[0]
@@ -211,7 +211,7 @@ def _best_inertia(model: Model, recordings: Sequence[Signals]) -> float:
 def _start_of_arm(chains: CutChains) -> Model:
     """Start values of the arm's parameters, from a regression on the measured speed."""
     model = chains.model
-    coarse = [replace(_coarser(chain.signals), duty=chain.signals.duty[:0]) for chain in chains.each]
+    coarse = [replace(_downsampled(chain.signals), duty=chain.signals.duty[:0]) for chain in chains.each]
     lifts = []
     for chain, s in zip(chains.each, coarse):
         every = max(1, round(s.period / chain.signals.period))
@@ -292,7 +292,7 @@ def _start_of_decay(model: Model, recordings: Sequence[Signals]) -> Model:
                    sensing={**model.sensing, "angle_filter_tau": 0.0})
 
 
-def _coarser(s: Signals) -> Signals:
+def _downsampled(s: Signals) -> Signals:
     """The recording with block means in place of samples; angle and duty only."""
     every = max(1, math.floor(COARSE / s.period))
     if every == 1:
@@ -325,7 +325,7 @@ def fit_with_effect(model: Model, recordings: Sequence[Signals], effect: Paramet
     Returns:
         Parameters, initial states and the size, by name; empty if no start is possible.
     """
-    coarse = [_coarser(s) for s in recordings]
+    coarse = [_downsampled(s) for s in recordings]
     tests = [_WeakForm(s) for s in coarse]
     likely = [found[0] for size in SIZES[effect.name]
               if (found := _likeliest(with_values(model, {effect.name: size}), coarse, tests))]
