@@ -4,6 +4,7 @@
     make blind                            312 recordings of 70 s: about an hour on two cores, 2.5 GB
     make blind ARGS="--count 60 --seed 7"
     make blind ARGS="--uncalibrated --count 120"    uncalibrated rigs
+    make blind ARGS="--circumstances --count 100"   rigs as they are: many imperfections, feedback, lost samples
     make blind ARGS=--docs                          the table of the last run goes into docs/results/blind.md
 
 Steps can be run alone: --steps make,diagnose,peers,score. The labels stay sealed until every verdict is written.
@@ -30,7 +31,7 @@ from aeropend_ident.diagnosis.results import document
 from aeropend_ident.signals.from_bag import from_recording
 from aeropend_ident.testing import bags
 from aeropend_sim.model.parameters import load
-from evaluation.blind import cases, limit, page, peers, plant, report, uncalibrated
+from evaluation.blind import cases, circumstances, limit, page, peers, plant, report, score, uncalibrated
 
 MODEL = "bench"
 SEALED = "labels.sealed"
@@ -154,10 +155,22 @@ def _uncalibrated_rigs(options: argparse.Namespace, steps: list[str]) -> None:
     if "diagnose" in steps:
         uncalibrated.diagnose_all(out, options.jobs)
     if "score" in steps:
-        found = uncalibrated.report(out)
-        conditions = page.conditions(options.count, options.seed)
-        document = {"conditions": conditions, "figures": [f.document() for f in found]}
-        (out / "results.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        _save(out, uncalibrated.report(out), options)
+
+
+def _circumstances(options: argparse.Namespace, steps: list[str]) -> None:
+    out = options.out / "circumstances"
+    if "make" in steps:
+        circumstances.make_all(out, options.count, options.seed, options.duration, options.jobs)
+    if "diagnose" in steps:
+        circumstances.diagnose_all(out, options.jobs)
+    if "score" in steps:
+        _save(out, circumstances.report(out), options)
+
+
+def _save(out: Path, found: list[score.Figure], options: argparse.Namespace) -> None:
+    made = {"conditions": page.conditions(options.count, options.seed), "figures": [f.document() for f in found]}
+    (out / "results.json").write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
 
 
 def main() -> None:
@@ -173,13 +186,19 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=[], help="diagnose only these recordings")
     parser.add_argument("--uncalibrated", "--unknown", action="store_true",
                         help="uncalibrated rigs: angle and command alone, and free decays")
+    parser.add_argument("--circumstances", action="store_true",
+                        help="rigs with many small imperfections, in closed loop, with wrong noise and lost samples")
     parser.add_argument("--docs", action="store_true",
                         help="run nothing, write the table of the last run into docs/results")
     options = parser.parse_args()
     steps = options.steps.split(",")
     if options.docs:
-        page.write(options.out / "unknown" if options.uncalibrated else options.out,
-                   "uncalibrated" if options.uncalibrated else "blind")
+        folder, name = (("unknown", "uncalibrated") if options.uncalibrated else
+                        ("circumstances", "circumstances") if options.circumstances else ("", "blind"))
+        page.write(options.out / folder, name)
+        return
+    if options.circumstances:
+        _circumstances(options, steps)
         return
     if options.uncalibrated:
         _uncalibrated_rigs(options, steps)

@@ -182,7 +182,7 @@ class Sizer:
         return math.exp(best), goal * math.exp(error)
 
 
-def _others(id_: str, rng: np.random.Generator) -> dict[str, float]:
+def others(id_: str, rng: np.random.Generator) -> dict[str, float]:
     """The parameters of an effect besides its size."""
     return {
         "winding_heating": lambda: {"tau": rng.uniform(10.0, 60.0)},
@@ -194,8 +194,8 @@ def _others(id_: str, rng: np.random.Generator) -> dict[str, float]:
     }.get(id_, dict)()
 
 
-def _sized(id_: str, sizer: Sizer, goal: float, form: str, nominal: Mapping[str, float],
-           rng: np.random.Generator) -> tuple[dict[str, object], float]:
+def sized(id_: str, sizer: Sizer, goal: float, form: str, nominal: Mapping[str, float],
+          rng: np.random.Generator) -> tuple[dict[str, object], float]:
     """An effect with its parameters, drawn, sized to leave `goal` floors; and its size in floors."""
     other = form == "other"
     if id_ in OUTSIDE:
@@ -210,7 +210,7 @@ def _sized(id_: str, sizer: Sizer, goal: float, form: str, nominal: Mapping[str,
         name = str(rng.choice(list(MISMATCHES)))
         value = nominal[name] * (1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(0.15, 0.4))
         return {"effect": id_, "place": MISMATCHES[name], "parameters": {name: value}}, 0.0
-    head, rest = EFFECTS[id_][0], _others(id_, rng)
+    head, rest = EFFECTS[id_][0], others(id_, rng)
     start = OWN_SIZES.get(id_, SIZES.get(head, 1.0))
     sign = -1.0 if start < 0.0 else 1.0
     if id_ in ("angle_offset", "current_offset", "voltage_offset", "current_gain", "thrust_exponent", "supply_drift"):
@@ -252,7 +252,7 @@ def draw(name: str, kind: str, effects: list[str], form: str, nominal: Mapping[s
     for id_ in effects:
         assert sizer is not None
         goal = math.exp(rng.uniform(*np.log(FLOORS)))
-        entry, size = _sized(id_, sizer, goal, form, nominal, rng)
+        entry, size = sized(id_, sizer, goal, form, nominal, rng)
         drawn.append(entry)
         sizes.append(size)
     inside = {str(e["effect"]): e["parameters"] for e in drawn if e["effect"] in EFFECTS}

@@ -130,7 +130,7 @@ def driven(name: str, effect: str, form: str, nominal: Mapping[str, float], tau:
 
 def _sized(effect: str, sizer: AngleSizer, goal: float, other: bool, rng: np.random.Generator
            ) -> tuple[dict[str, Any], float]:
-    head, rest = plant.EFFECTS[effect][0], cases._others(effect, rng)
+    head, rest = plant.EFFECTS[effect][0], cases.others(effect, rng)
     start = cases.OWN_SIZES.get(effect, cases.SIZES.get(head, 1.0))
     sign = -1.0 if start < 0.0 else 1.0
     if effect in ("angle_offset", "thrust_exponent"):

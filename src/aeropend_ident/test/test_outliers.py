@@ -30,7 +30,7 @@ def test_a_sound_recording_has_neither(duty):
     for effect in (None, *CATALOGUE):
         columns = readings(DUTIES[duty], {effect: {}} if effect else {})
         for channel, sigma in SIGMA.items():
-            assert not saturated(columns[channel], smooth=channel == "theta").any(), (effect, channel)
+            assert not saturated(columns[channel], SAMPLE_PERIOD, smooth=channel == "theta").any(), (effect, channel)
             assert not jumps_out(columns[channel], sigma).any(), (effect, channel)
 
 
@@ -42,7 +42,7 @@ def test_the_end_of_a_range_is_found_to_the_sample(channel, low, high):
     x[::97] = np.nan
     at = (x == low if low is not None else False) | (x == high if high is not None else False)
     assert at.mean() > 0.005
-    np.testing.assert_array_equal(saturated(x, smooth=channel == "theta"), at)
+    np.testing.assert_array_equal(saturated(x, SAMPLE_PERIOD, smooth=channel == "theta"), at)
 
 
 def test_an_angle_without_noise_hits_a_limit_suddenly_and_comes_to_rest_slowly():
@@ -50,10 +50,18 @@ def test_an_angle_without_noise_hits_a_limit_suddenly_and_comes_to_rest_slowly()
     lsb = BENCH.sensing["angle_lsb"]
     swinging = lsb * np.round(0.6 * np.sin(3.0 * time) / lsb)
     settling = lsb * np.round(0.5 * (1.0 - np.exp(-((time - 1.0).clip(0.0) / 1.5) ** 2)) / lsb)
-    assert not saturated(swinging, smooth=True).any()
-    assert not saturated(settling, smooth=True).any()
+    assert not saturated(swinging, SAMPLE_PERIOD, smooth=True).any()
+    assert not saturated(settling, SAMPLE_PERIOD, smooth=True).any()
     clipped = np.minimum(swinging, 0.4)
-    np.testing.assert_array_equal(saturated(clipped, smooth=True), clipped == 0.4)
+    np.testing.assert_array_equal(saturated(clipped, SAMPLE_PERIOD, smooth=True), clipped == 0.4)
+
+
+@pytest.mark.parametrize("every", [1, 10])
+def test_an_arm_that_rests_at_exactly_0_before_it_moves_is_at_no_limit(every):
+    time = np.arange(0.0, 30.0, every * SAMPLE_PERIOD)
+    swing = np.where(time > 5.0, 0.6 * (1.0 - np.cos(2.0 * (time - 5.0))), 0.0)
+    x = 0.001 * np.round(swing / 0.001)
+    assert not saturated(x, every * SAMPLE_PERIOD, smooth=True).any()
 
 
 @pytest.mark.parametrize("channel", SIGMA)
@@ -69,6 +77,6 @@ def test_single_readings_that_jump_out_are_found(channel):
 
 @pytest.mark.parametrize("x", [np.zeros(0), np.full(50, np.nan), np.full(50, 0.3), np.arange(5.0)])
 def test_what_holds_too_little_has_neither(x):
-    assert not saturated(x, smooth=True).any()
+    assert not saturated(x, SAMPLE_PERIOD, smooth=True).any()
     assert not jumps_out(x, 1e-3).any()
-    assert len(saturated(x)) == len(jumps_out(x, 1e-3)) == len(x)
+    assert len(saturated(x, SAMPLE_PERIOD)) == len(jumps_out(x, 1e-3)) == len(x)

@@ -5,9 +5,9 @@ import pytest
 from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.signals.pulses import find_pulses
 from aeropend_ident.signals.signals import from_arrays
-from aeropend_ident.testing.rigs import BENCH, drawn_rig, recorded, steps
+from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import rig
-from aeropend_sim.model.parameters import SAMPLE_PERIOD
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 
 
 def columns(duration=6.0, **replaced):
@@ -164,8 +164,43 @@ def test_lost_samples_do_not_count():
     assert signals.samples == len(signals) - len(range(50, len(signals), 100))
 
 
-def test_noise_larger_than_the_model_says_is_seen():
+@pytest.mark.parametrize("factor", [0.3, 1.0, 3.0])
+@pytest.mark.parametrize("feedback", [False, True])
+def test_noise_is_right_within_a_tenth_in_open_and_closed_loop(factor, feedback):
+    duty, rng = steps(40.0, 3), np.random.default_rng(1)
+    if feedback:  # a controller takes the noise of the angle into the duty at every sample
+        duty = np.clip(duty + 0.01 * rng.standard_normal(len(duty)), 0.0, 1.0)
+    noisy = BENCH.sensing | {name: factor * BENCH.sensing[name] for name in ("angle_noise", "current_noise",
+                                                                            "voltage_noise")}
+    read, truth = rig.record(Model("noisy", BENCH.model, noisy, {}), duty, 3)
+    signals = from_arrays({**read, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)
+    for channel in ("i_a", "v_a"):
+        true = np.std(read[channel] - truth[channel])
+        assert signals.sigma[channel] == pytest.approx(true, rel=0.1), channel
+    quantised = BENCH.sensing["angle_lsb"] / np.sqrt(12.0)
+    assert signals.sigma["theta"] == pytest.approx(max(np.hypot(noisy["angle_noise"], quantised), quantised), rel=0.1)
+
+
+def test_too_few_readings_have_the_noise_that_the_model_states():
     data = columns()
-    data["i_a"] = data["i_a"] + 0.05 * np.random.default_rng(0).standard_normal(len(data["i_a"]))
-    assert from_arrays(data, SAMPLE_PERIOD, BENCH.sensing).sigma["i_a"] == pytest.approx(0.05, rel=0.1)
-    assert recorded(0, duration=6.0).sigma["i_a"] == pytest.approx(0.005, rel=0.01)
+    data["i_a"] = np.where(np.arange(len(data["i_a"])) % 200 == 0, data["i_a"], np.nan)
+    stated = np.hypot(BENCH.sensing["current_noise"], BENCH.sensing["current_lsb"] / np.sqrt(12.0))
+    assert from_arrays(data, SAMPLE_PERIOD, BENCH.sensing).sigma["i_a"] == stated
+
+
+@pytest.mark.promise(
+    "Recordings", "Lost samples, saturated or constant readings, and pauses are noted, and do not change the verdict")
+@pytest.mark.parametrize("lost", [1, 2, 7])
+def test_a_step_of_the_duty_into_lost_samples_lies_in_their_middle_and_is_said(lost):
+    data = columns()
+    step = int(np.flatnonzero(np.abs(np.diff(data["duty"])) > 0.05)[2]) + 1
+    first = step - lost // 2
+    for name in data:
+        data[name] = data[name].copy()
+        data[name][first:first + lost] = np.nan
+    signals = from_arrays(data, SAMPLE_PERIOD, BENCH.sensing)
+    before, after = data["duty"][first - 1], data["duty"][first + lost]
+    mean = np.mean(signals.duty[first:first + lost])  # the step may lie anywhere from the first lost sample on
+    assert mean == pytest.approx(before + (after - before) * (lost / 2) / lost, abs=0.5 * abs(after - before) / lost)
+    assert np.isnan(signals.i_a[first + lost:first + lost + 5]).all()
+    assert any("1 step of the duty fell between samples" in note for note in signals.notes)

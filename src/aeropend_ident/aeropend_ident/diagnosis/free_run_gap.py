@@ -149,7 +149,7 @@ def floor(signals: Signals, start: int, stop: int) -> dict[str, float]:
     floors = {c: signals.sigma[c] for c in CHANNELS}
     p = signals.pulses
     if p is not None:
-        mine = (p.index >= start) & (p.index < stop)
+        mine = (p.index >= start) & (p.index < stop) & p.sure
         if mine.any():
             floors["omega"] = float(np.sqrt(np.average(p.sigma[mine] ** 2, weights=p.period[mine])))
     return floors

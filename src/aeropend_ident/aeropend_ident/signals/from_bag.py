@@ -14,13 +14,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aeropend_ident.bags import recording
 from aeropend_ident.bags.recording import Recording, RecordingError
 from aeropend_ident.signals.free_decay import degrees, free_decay
 from aeropend_ident.signals.grid import check_period, irregular_grid, longest_piece, regular_grid
 from aeropend_ident.signals.noise import reading_noise_at
+from aeropend_ident.signals.pulses import hold
 from aeropend_ident.signals.signals import CHANNELS, STILL, Signals, from_arrays
+
+Array = NDArray[np.float64]
 
 FEWEST = 30
 """Samples of an uncalibrated rig below which there is no verdict (choice).
@@ -33,6 +37,12 @@ LONGEST_PERIOD = 5e-3
 Choice: a command that is late by half of it moves the arm by less than a reading's noise.
 
 Measured: at ±30 % no verdict of 5 recordings changes (docs/results/thresholds.md)."""
+
+FOLLOWED = 0.9
+"""Share of the steps of the duty that the commands must explain to fill in the samples that are lost (choice)."""
+
+LATEST = 3
+"""Samples between a command and the sample that reports it, at most (choice: a bridge has one or two)."""
 
 MOVES = 3.0
 """Standard deviations of a reading that a channel must vary by to show that the motor runs (choice).
@@ -87,7 +97,9 @@ def from_recording(read: Recording, sensing: Mapping[str, float], held_out: floa
         RecordingError: no verdict is possible; one line that says why.
     """
     index, period = regular_grid(read)
-    return from_arrays(_columns(read, index), period, sensing, held_out, read.path, read.notes)
+    columns = _columns(read, index)
+    columns["duty"] = with_commands(columns["duty"], read, index)
+    return from_arrays(columns, period, sensing, held_out, read.path, read.notes)
 
 
 def from_uncalibrated(read: Recording, sensing: Mapping[str, float], held_out: float = 0.3) -> Signals:
@@ -122,12 +134,42 @@ def from_uncalibrated(read: Recording, sensing: Mapping[str, float], held_out: f
                         for c in ("omega", "i_a", "v_a")):
         return free_decay(read, columns["theta"], period, sigma["theta"], held_out,
                           commanded=bool(np.isfinite(duty).any()))
+    if np.isfinite(duty).any():
+        columns["duty"] = hold(duty)
     signals = from_arrays(columns, period, own, held_out, read.path, read.notes)
     if signals.pulses is not None:  # the accuracy of the speed is that of its pulses
         sigma.pop("omega", None)
     said = (f"angle: a reading has a standard deviation of {degrees(sigma['theta'])}, from noise and resolution, "
             "estimated from the recording")
     return replace(signals, sigma={**signals.sigma, **sigma}).noted(said)
+
+
+def with_commands(duty: Array, read: Recording, index: NDArray[np.int64]) -> Array:
+    """The duty with the samples that were lost filled in from the commands, if these explain all other samples.
+
+    Args:
+        duty: (N,) on the grid, NaN where a sample is missing.
+        read: the recording, with the instants at which commands were received.
+        index: (M,) of each sample on the grid.
+    """
+    taken = np.isfinite(read.command)
+    times, commands = read.command_ns[taken], np.clip(read.command[taken], 0.0, 1.0)
+    missing = ~np.isfinite(duty)
+    if not missing.any() or len(times) < 2:
+        return duty
+    grid = np.arange(len(duty))
+    received = np.interp(grid, index, read.received_ns.astype(float))
+    period = float(np.median(np.diff(received)))
+    known = grid[~missing]
+    best, right = duty, FOLLOWED
+    for late in range(LATEST + 1):  # a rig takes a command over with its next sample, or the one after
+        last = np.searchsorted(times, received - late * period, side="right") - 1
+        followed = np.where(last >= 0, commands[np.maximum(last, 0)], np.nan)
+        stepped = known[1:][np.abs(np.diff(duty[known])) > STILL]
+        share = float(np.mean(np.abs(followed[stepped] - duty[stepped]) < STILL)) if len(stepped) else 0.0
+        if share > right:
+            best, right = np.where(missing, followed, duty), share
+    return best
 
 
 def _columns(read: Recording, index: np.ndarray) -> dict[str, np.ndarray]:

@@ -19,13 +19,23 @@ Measured: at ±30 % no verdict of 23 recordings changes (docs/results/thresholds
 QUIET = 0.9
 """Share of equal neighbours above which a channel shows no noise that could tell a limit from a rest (choice).
 
+So does an angle that goes on in one direction from change to change in as large a share.
+
 Measured: at ±30 % no verdict of 23 recordings changes (docs/results/thresholds.md)."""
 
 SHORTEST = 4
 """Equal readings in a row that never count as a limit, whatever the noise (choice)."""
 
-APPROACH = 15
-"""Samples over which the signal must keep its speed before it stops at a limit: 30 ms at 490 Hz (choice)."""
+APPROACH = 0.03
+"""[s] Time over which the signal must keep its speed before it stops at a limit (choice: the noise is then small)."""
+
+FEWEST_IN_APPROACH = 3
+"""Samples of that time at least, at a low rate (choice)."""
+
+CLEAR = 4.0
+"""Steps of the resolution that a signal must move while it approaches a limit.
+
+Derived: with fewer, a parabola that turns at the end seems to keep its speed."""
 
 NEIGHBOURS = 3
 """Readings on either side with which a single one is compared (choice)."""
@@ -36,7 +46,7 @@ FAR = 8.0
 Choice: normal noise exceeds it in one of 10^15 readings, which leaves room for heavier tails."""
 
 
-def saturated(x: Array, *, smooth: bool = False) -> Mask:
+def saturated(x: Array, period: float, *, smooth: bool = False) -> Mask:
     """Find the samples of a channel that sit at the end of its range, where the true value may lie beyond.
 
     At a limit all readings are equal to the last bit; at a true plateau the noise goes on. The largest and the
@@ -45,7 +55,9 @@ def saturated(x: Array, *, smooth: bool = False) -> Mask:
 
     Args:
         x: (N,) readings, NaN where missing.
-        smooth: whether the signal has no jumps (an angle). A limit is then found without noise too, by a sudden stop.
+        period: [s] between samples.
+        smooth: whether the signal has no jumps (an angle). A limit is then found without noise too, by a sudden stop;
+            and a series that begins at an end of its range rests there, unless it stops there suddenly later.
 
     Returns:
         (N,) mask.
@@ -53,7 +65,8 @@ def saturated(x: Array, *, smooth: bool = False) -> Mask:
     out = np.zeros(len(x), dtype=bool)
     known = np.flatnonzero(np.isfinite(x))
     y = x[known]
-    if len(y) < 2 * APPROACH or np.ptp(y) == 0.0:
+    approach = max(FEWEST_IN_APPROACH, round(APPROACH / period))
+    if len(y) < 2 * approach or np.ptp(y) == 0.0:
         return out
     for end in (float(y.max()), float(y.min())):
         at = y == end
@@ -62,14 +75,23 @@ def saturated(x: Array, *, smooth: bool = False) -> Mask:
             continue
         equal = float(np.mean(y[1:][inside] == y[:-1][inside]))
         starts, lengths = runs(at)
-        if equal < QUIET:
+        if equal < QUIET and not (smooth and _reversals(y) < 1.0 - QUIET):
             enough = 1.0 + math.log(CHANCE / len(y)) / math.log(max(equal, 1e-3))
-            hit = bool((lengths >= max(enough, SHORTEST)).any())
+            long = starts[lengths >= max(enough, SHORTEST)]
+            at_rest = smooth and bool(np.any(long == 0))  # an arm that hangs at the beginning repeats a reading too
+            hit = _sudden(y, long, end, approach) if at_rest else bool(len(long))
         else:
-            hit = smooth and end != 0.0 and _sudden(y, starts[lengths >= APPROACH], end)
+            hit = smooth and end != 0.0 and _sudden(y, starts[lengths >= approach], end, approach)
         if hit:
             out[known[at]] = True
     return out
+
+
+def _reversals(y: Array) -> float:
+    """Share of the changes of a series (N,) that go back: about 0 without noise, more than half for noise alone."""
+    way = np.sign(np.diff(y))
+    way = way[way != 0.0]
+    return float(np.mean(way[1:] != way[:-1])) if len(way) > 1 else 0.0
 
 
 def runs(at: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -78,16 +100,16 @@ def runs(at: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return edges[::2], edges[1::2] - edges[::2]
 
 
-def _sudden(y: Array, starts: NDArray[np.int64], end: float) -> bool:
-    """Whether a smooth signal reaches `end` without slowing down."""
-    starts = starts[starts >= 2 * APPROACH]
+def _sudden(y: Array, starts: NDArray[np.int64], end: float, approach: int) -> bool:
+    """Whether a smooth signal reaches `end` without slowing down over the last samples before some starts."""
+    starts = starts[starts >= 2 * approach]
     if not len(starts):
         return False
     levels = np.unique(y)
-    resolution = float(np.min(np.diff(levels)))
-    last = np.abs(y[starts - APPROACH] - end)
-    before = np.abs(y[starts - 2 * APPROACH] - y[starts - APPROACH])
-    return float(last.sum()) > max(0.6 * float(before.sum()), 1.5 * resolution * len(starts))
+    resolution = float(np.median(np.diff(levels)))  # a limit need not be a whole step
+    last = np.abs(y[starts - approach] - end)
+    before = np.abs(y[starts - 2 * approach] - y[starts - approach])
+    return float(last.sum()) > max(0.6 * float(before.sum()), CLEAR * resolution * len(starts))
 
 
 def jumps_out(x: Array, sigma: float) -> Mask:

@@ -28,6 +28,10 @@ CLOCK_TOLERANCE = 2e-4
 Measured: at ±30 % no verdict of 20 recordings changes (docs/results/thresholds.md)."""
 
 
+UNSURE = 0.5
+"""Relative standard deviation of an interval whose length is not known: it counts for next to nothing (choice)."""
+
+
 @dataclass(frozen=True)
 class Pulses:
     """The intervals between pulses that a held speed shows, one entry an interval.
@@ -51,6 +55,11 @@ class Pulses:
     def of(self, which: NDArray[np.bool_]) -> Pulses:
         """The intervals that a mask (M,) selects."""
         return Pulses(*(getattr(self, f.name)[which] for f in fields(self)))
+
+    @property
+    def sure(self) -> NDArray[np.bool_]:
+        """(M,) true for an interval whose length is known."""
+        return self.sigma < UNSURE * self.omega
 
     def then(self, others: Pulses) -> Pulses:
         """These intervals, followed by others."""
@@ -133,7 +142,7 @@ def find_pulses(omega: Array, period: float, sensing: Mapping[str, float]) -> Pu
     tick = np.maximum(sensing["speed_tick"], 1e-6) * speed / np.maximum(length, 1e-9) if len(at) else np.zeros(0)
     sigma: Array = np.sqrt(tick**2 + sensing["speed_noise"] ** 2 + (room * slope) ** 2
                            + (CLOCK_TOLERANCE * speed) ** 2)
-    sigma = np.where(anew, 0.5 * speed, sigma)
+    sigma = np.where(anew, UNSURE * speed, sigma)
     whole = time >= length  # an interval that began before the recording cannot be simulated
     return Pulses(at[whole], time[whole], length[whole], speed[whole], sigma[whole], false[whole])
 

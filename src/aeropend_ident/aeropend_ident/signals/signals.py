@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.bags.recording import RecordingError
-from aeropend_ident.signals.noise import white_noise
+from aeropend_ident.signals.noise import innovation_noise, least_noise, white_noise
 from aeropend_ident.signals.outliers import far_from_median, jumps_out, saturated
-from aeropend_ident.signals.pulses import Pulses, find_pulses, hold
+from aeropend_ident.signals.pulses import UNSURE, Pulses, find_pulses, hold
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
+from aeropend_sim.wording import counted
 
 Array = NDArray[np.float64]
 
@@ -35,10 +36,11 @@ SETTLED = 0.012
 
 Choice: about ten electrical time constants L_a/R_a of the preset `bench`."""
 
-SEEN_OVER_STATED = 2.0
-"""Ratio of the noise seen to the noise stated above which the noise seen counts (choice).
+ROTOR = 0.25
+"""[s] Time constant with which a wrong speed of the rotor dies away (measured: preset `bench` at low speed)."""
 
-Quantisation spoils the estimate of a noise that is small beside the resolution."""
+DIED_AWAY = 5.0
+"""Time constants after which the speed error of one sample of acceleration is below the timing of a pulse (choice)."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +140,10 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
     if not np.isfinite(columns["duty"]).any():
         raise RecordingError(f"{name}: no duty was recorded (armature.percentage or duty_command); "
                              "without it the model has no input")
-    duty = hold(columns["duty"])
+    duty, unsure = _between_samples(columns["duty"])
+    shaken = np.zeros(n, dtype=bool)
+    for gap in unsure:
+        shaken[gap.stop:gap.stop + round(ROTOR * (DIED_AWAY + math.log(gap.stop - gap.start)) / period)] = True
     train = max(1, round(n * (1.0 - held_out)))
     columns, said = dict(columns), [*notes]
     for channel in ("omega", "i_a", "v_a"):
@@ -146,7 +151,7 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
         if len(x) and np.ptp(x) == 0.0 and np.ptp(duty) > STILL:
             columns[channel] = np.full(n, np.nan)
             said.append(f"{channel} is {x[0]:g} {CHANNELS[channel]} all the time, whatever the duty: it is left out")
-    said += _leave_out(columns, train)
+    said += _leave_out(columns, period, train)
     if np.ptp(columns["theta"][np.isfinite(columns["theta"])]) == 0.0:
         raise RecordingError(f"{name}: the arm angle stays the same all the time: the sensor or the arm is stuck, "
                              "so no verdict is possible")
@@ -155,7 +160,11 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
         near = steps[:, None] + np.arange(math.ceil(SETTLED / period) + 1)
         columns["i_a"] = columns["i_a"].copy()
         columns["i_a"][np.minimum(near, n - 1)] = np.nan
-    sigma = _noise(columns, sensing, train)
+    if len(unsure):
+        said.append(f"{counted(len(unsure), 'step')} of the duty fell between samples, into lost ones, at an instant "
+                    "that nothing shows: current and speed are not compared just after")
+        columns["i_a"] = np.where(shaken, np.nan, columns["i_a"])
+    sigma = _noise(columns, duty, sensing, train)
     if np.ptp(duty) < STILL and np.nanstd(columns["theta"]) < 2.0 * sigma["theta"]:
         raise RecordingError(f"{name}: nothing happens in it, duty and angle stay where they are, so no verdict is "
                              "possible; record while `excite` runs")
@@ -163,6 +172,7 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
     if sensing["speed_pulses_per_rev"] > 0.0 and np.isfinite(columns["omega"]).any():
         pulses = find_pulses(columns["omega"], period, sensing)
         pulses = find_pulses(columns["omega"][:train], period, sensing).then(pulses.of(pulses.index >= train))
+        pulses = replace(pulses, sigma=np.where(shaken[pulses.index], UNSURE * pulses.omega, pulses.sigma))
     false_speed = pulses.false_samples(n) if pulses else split_apply(
         lambda x: far_from_median(x, sigma["omega"]), columns["omega"], train)
     return Signals(period, duty, columns["theta"], columns["omega"], columns["i_a"], columns["v_a"], sigma, pulses,
@@ -183,23 +193,45 @@ def split_apply(of: Callable[[Array], NDArray[Any]], x: Array, train: int) -> ND
     return np.concatenate([of(x[:train]), of(x)[train:]])
 
 
-def _noise(columns: Mapping[str, Array], sensing: Mapping[str, float], train: int) -> dict[str, float]:
-    """Standard deviation of a reading by channel: as the model states it, or as the readings show it."""
+def _between_samples(duty: Array) -> tuple[Array, list[slice]]:
+    """The duty (N,) without gaps, and the gaps in which it stepped at an unknown instant.
+
+    The step is put into the middle of the gap, where its error is least; into the middle of a sample period by the
+    mean of both duties.
+    """
+    held = hold(duty)
+    known = np.flatnonzero(np.isfinite(duty))
+    before, after = known[:-1], known[1:]
+    gaps = (after - before > 1) & (np.abs(duty[after] - duty[before]) > STILL)
+    for a, b in zip(before[gaps], after[gaps], strict=True):
+        middle = 0.5 * (a + b + 1)
+        held[math.ceil(middle):b] = duty[b]
+        if middle != math.ceil(middle):
+            held[math.floor(middle)] = 0.5 * (duty[a] + duty[b])
+    return held, [slice(int(a) + 1, int(b)) for a, b in zip(before[gaps], after[gaps], strict=True)]
+
+
+def _noise(columns: Mapping[str, Array], duty: Array, sensing: Mapping[str, float], train: int) -> dict[str, float]:
+    """Standard deviation of a reading by channel: as the readings show it, as the model states it if they are few.
+
+    The resolution counts in any case: while a coarse channel rests it shows no noise.
+    """
     sigma = {"omega": max(sensing["speed_noise"], white_noise(columns["omega"][:train]))}
     for channel, key in (("theta", "angle"), ("i_a", "current"), ("v_a", "voltage")):
-        stated = math.hypot(sensing[f"{key}_noise"], sensing[f"{key}_lsb"] / math.sqrt(12.0))
-        seen = white_noise(columns[channel][:train])
-        sigma[channel] = seen if seen > SEEN_OVER_STATED * stated else stated
+        x, quantised = columns[channel][:train], sensing[f"{key}_lsb"] / math.sqrt(12.0)
+        seen = innovation_noise(x, duty[:train])
+        stated = math.hypot(sensing[f"{key}_noise"], quantised)
+        sigma[channel] = stated if seen is None else max(seen, quantised, least_noise(x))
     return sigma
 
 
-def _leave_out(columns: dict[str, Array], train: int) -> list[str]:
+def _leave_out(columns: dict[str, Array], period: float, train: int) -> list[str]:
     """Replace saturated readings and outliers in the columns by NaN; returns a note for each kind."""
     said = []
     for channel, unit in CHANNELS.items():
         x = columns[channel]
         if channel != "omega":  # a speed is held between its pulses
-            limit = split_apply(partial(saturated, smooth=channel == "theta"), x, train)
+            limit = split_apply(partial(saturated, period=period, smooth=channel == "theta"), x, train)
             if limit.any():
                 ends = " and ".join(f"{e:g}" for e in np.unique(x[limit]))
                 said.append(f"{channel} sits at {ends} {unit}, the end of its range, for {100.0 * limit.mean():.1f} % "

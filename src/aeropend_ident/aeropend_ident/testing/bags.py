@@ -20,8 +20,16 @@ START_NS = 1_700_000_000_000_000_000
 NAN = math.nan
 
 
-def write(path: Path, columns: Mapping[str, NDArray[np.float64]], period_ns: int) -> None:
-    """Write theta, omega, i_a, v_a, duty (N,) as samples `period_ns` apart into a new folder."""
+def write(path: Path, columns: Mapping[str, NDArray[np.float64]], period_ns: int,
+          lost: NDArray[np.bool_] | None = None) -> None:
+    """Write a recording into a new folder.
+
+    Args:
+        path: the folder.
+        columns: theta, omega, i_a, v_a, duty (N,).
+        period_ns: [ns] between samples.
+        lost: (N,) samples that are left out.
+    """
     header = STORE.types["std_msgs/msg/Header"](STORE.types["builtin_interfaces/msg/Time"](0x11223344, 0x55667788), "")
     marks = [1.25e200 + k * 1e190 for k in range(2)]
     small = [struct.unpack("<f", struct.pack("<f", 1.25e30 * (k + 1)))[0] for k in range(3)]
@@ -49,6 +57,6 @@ def write(path: Path, columns: Mapping[str, NDArray[np.float64]], period_ns: int
             rows.append(table)
         topics = [writer.add_connection(t, k, typestore=STORE) for t, k in (("joint_states", JOINT),
                                                                             ("armature", BATTERY))]
-        for k in range(n):
+        for k in range(n) if lost is None else np.flatnonzero(~lost):
             for topic, table in zip(topics, rows, strict=True):
                 writer.write(topic, int(stamps[k]) + 300_000, table[k].tobytes())

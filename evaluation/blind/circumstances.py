@@ -1,0 +1,409 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The blind check of rigs as they are: many small imperfections, feedback, wrong noise, lost samples, three effects.
+
+Each circumstance is a row of its own. The rigs are those of `plant`; what a recording holds is drawn here. The share of
+an effect in the gap is that of the mean square which no refit of the numbers absorbs.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import time
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from joblib import Parallel, delayed
+from numpy.typing import NDArray
+
+from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.document import to_json
+from aeropend_ident.diagnosis.results import document
+from aeropend_ident.signals.from_bag import signals_of
+from aeropend_ident.testing import bags
+from aeropend_sim.errors import UserError
+from aeropend_sim.model.parameters import load
+from evaluation.blind import cases, plant, score
+from evaluation.blind.plant import EFFECTS, OUTSIDE, PERIOD
+
+Array = NDArray[np.float64]
+
+MODEL = "bench"
+SEALED = "labels.sealed"
+
+ROWS = {"messy": 0.4, "closed loop": 0.2, "nothing missing": 0.25, "three effects": 0.15}
+"""Circumstance -> share of the recordings."""
+
+BACKGROUND = (10, 12)
+"""Imperfections of a messy rig, at least and at most."""
+
+SMALL = (0.2, 1.2)
+"""Floors, in its worst channel, of one imperfection of a messy rig."""
+
+MAIN_SHARE = (0.2, 0.95)
+"""Share of the gap that the main effect of a messy rig makes."""
+
+GHOST = 0.03
+"""True share of the gap below which an effect that is claimed is not there."""
+
+RANDOM_OR_STEPPED = ("command_delay", "speed_spikes", "current_clip", "slew_limit", "brown_outs")
+"""Effects whose gap does not grow in proportion to their size: they are no imperfections of a messy rig."""
+
+
+class Weighed(cases.Sizer):
+    """A rig whose effects are weighed by the gap that they leave after a refit of the numbers."""
+
+    def rest(self, p: Array, gusts: Array) -> Array:
+        """What no refit of the numbers absorbs, (4, N), each channel in floors."""
+        y, v, _ = plant.states(p, self.duty, gusts)
+        moved = self.stack(plant.shown(p, y, v)) - self.base
+        return (moved - self.q @ (self.q.T @ moved)).reshape(len(self.floor), -1)
+
+    def gap(self, rest: Array) -> Array:
+        """The same over the spread of each channel: the mean square of all is the squared gap."""
+        spread = np.std(self.base.reshape(len(self.floor), -1), axis=1)
+        return rest / spread[:, None]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """An effect of a recording.
+
+    Attributes:
+        effect: its id.
+        place: of the chain.
+        parameters: by name; of an effect outside of the catalogue its size.
+        gusts: (N + 2,) random torque, or (0,).
+        rest: (4, N) what it alone leaves, in floors.
+    """
+
+    effect: str
+    place: str
+    parameters: dict[str, float]
+    gusts: Array
+    rest: Array
+
+    def scaled(self, rig: Weighed, factor: float) -> Drawn:
+        """The effect at another size."""
+        own = dict(self.parameters)
+        head = EFFECTS[self.effect][0] if self.effect in EFFECTS else "size"
+        neutral = 2.0 if head == "n" else 0.0
+        own[head] = neutral + factor * (own[head] - neutral)
+        gusts = factor * self.gusts
+        return Drawn(self.effect, self.place, own, gusts, rig.rest(_packed(rig, [(self.effect, own)]), gusts))
+
+
+def _packed(rig: Weighed, effects: Sequence[tuple[str, Mapping[str, float]]]) -> Array:
+    inside = {e: own for e, own in effects if e in EFFECTS}
+    outside = {e: own["size"] for e, own in effects if e in OUTSIDE}
+    return rig.packed(inside, outside, other=True)
+
+
+def small(effect: str, rig: Weighed, rng: np.random.Generator) -> Drawn:
+    """An imperfection of a messy rig: an effect in another form than the catalogue's, at a size of about a floor."""
+    rest = cases.others(effect, rng) if effect in EFFECTS else {}
+    start = OUTSIDE[effect][1] if effect in OUTSIDE else cases.OWN_SIZES.get(
+        effect, cases.SIZES.get(EFFECTS[effect][0], 1.0))
+    head = EFFECTS[effect][0] if effect in EFFECTS else "size"
+    neutral = 2.0 if head == "n" else 0.0
+    sign = float(rng.choice([-1.0, 1.0])) if effect in {"angle_offset", "current_offset", "voltage_offset",
+                                                       "current_gain", "thrust_exponent"} else 1.0
+    own = {head: neutral + 0.1 * sign * start, **rest}
+    gusts = np.zeros(0)
+    if effect == "gust":
+        gusts = plant.turbulence(own["sigma"], own["tau"], len(rig.duty), True, rng)
+    place = OUTSIDE[effect][0] if effect in OUTSIDE else cases.PLACES[effect]
+    drawn = Drawn(effect, place, own, gusts, rig.rest(_packed(rig, [(effect, own)]), gusts))
+    goal = math.exp(rng.uniform(*np.log(SMALL)))
+    return drawn.scaled(rig, goal / max(_floors(drawn.rest), 1e-3))
+
+
+def _floors(rest: Array) -> float:
+    return float(np.sqrt(np.mean(rest**2, axis=1)).max())
+
+
+def messy(rng: np.random.Generator, numbers: Mapping[str, float], sensing: Mapping[str, float], duty: Array
+          ) -> tuple[list[Drawn], dict[str, float]]:
+    """A rig with many small imperfections and one main effect; and the share of each in the gap."""
+    rig = Weighed(numbers, sensing, duty)
+    kinds = [e for e in (*EFFECTS, *OUTSIDE) if e not in RANDOM_OR_STEPPED]
+    mains = [e for e in EFFECTS if e not in RANDOM_OR_STEPPED]
+    while True:
+        main = str(rng.choice(mains))
+        others = [str(e) for e in rng.permutation([e for e in kinds if e != main])]
+        background = [small(e, rig, rng) for e in others[:rng.integers(BACKGROUND[0], BACKGROUND[1] + 1)]]
+        behind = np.sum([rig.gap(d.rest) for d in background], axis=0)
+        goal = rng.uniform(*MAIN_SHARE)
+        one = small(main, rig, rng)
+        for _ in range(4):  # the gap of an effect grows about with its size
+            amount = float(np.mean(rig.gap(one.rest) ** 2)) / float(np.mean(behind**2))
+            one = one.scaled(rig, math.sqrt(goal / (1.0 - goal) / max(amount, 1e-6)))
+        all_ = [one, *background]
+        total = np.sum([rig.gap(d.rest) for d in all_], axis=0)
+        shares = {d.effect: 1.0 - float(np.mean((total - rig.gap(d.rest)) ** 2) / np.mean(total**2)) for d in all_}
+        if shares[main] > MAIN_SHARE[0] and all(shares[main] > shares[d.effect] for d in background):
+            return all_, shares
+
+
+def relay(rng: np.random.Generator) -> Callable[[float, float], float]:
+    """A controller with two levels and a hysteresis."""
+    low, high, goal = rng.uniform(0.0, 0.15), rng.uniform(0.35, 0.5), rng.uniform(0.15, 0.5)
+    memory = {"u": high}
+
+    def law(t: float, theta: float) -> float:
+        wanted = goal + 0.1 * math.sin(0.5 * t)
+        if abs(theta - wanted) > 0.03:
+            memory["u"] = high if theta < wanted else low
+        return memory["u"]
+
+    return law
+
+
+def lead(rng: np.random.Generator) -> Callable[[float, float], float]:
+    """A lead compensator around the duty that holds the arm, following a slow triangle."""
+    gain, mean, period = rng.uniform(0.2, 0.5), rng.uniform(0.2, 0.3), rng.uniform(6.0, 15.0)
+    zero, pole = rng.uniform(2.0, 4.0), rng.uniform(20.0, 40.0)
+    memory = {"error": 0.0, "u": 0.0}
+
+    def law(t: float, theta: float) -> float:
+        goal = 0.1 + 0.5 * abs(2.0 * (t / period % 1.0) - 1.0)
+        error = goal - theta
+        keep = math.exp(-pole * PERIOD)
+        memory["u"] = keep * memory["u"] + gain * pole / zero * (error - memory["error"] * math.exp(-zero * PERIOD))
+        memory["error"] = error
+        return min(max(mean + memory["u"], 0.0), 0.7)
+
+    return law
+
+
+CONTROLLERS = (cases.pid, relay, lead)
+
+
+def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing: Mapping[str, float], seed: int,
+         duration: float) -> tuple[dict[str, Any], dict[str, Array], NDArray[np.bool_]]:
+    """A recording of a circumstance.
+
+    Args:
+        row: the circumstance.
+        effects: of the recording; drawn here for "messy".
+        nominal: numbers of the model file.
+        sensing: of the model file.
+        seed: of all that is drawn.
+        duration: [s] of the recording.
+
+    Returns:
+        Its label, its channels (N,), and which samples were lost (N,).
+    """
+    rng = np.random.default_rng([seed, 19])
+    numbers = {k: v * (1.0 + rng.uniform(-cases.OFF, cases.OFF)) for k, v in nominal.items()}
+    duty = cases.duty_signal(rng, duration)
+    label: dict[str, Any] = {"row": row, "shares": {}, "effects": [], "seed": seed}
+    own = dict(sensing)
+    lost = np.zeros(len(duty), dtype=bool)
+    controller, gusts, other = None, np.zeros(0), True
+    if row == "messy":
+        drawn, label["shares"] = messy(rng, numbers, sensing, duty)
+        p = _packed(Weighed(numbers, sensing, duty), [(d.effect, d.parameters) for d in drawn])
+        gusts = next((d.gusts for d in drawn if len(d.gusts)), gusts)
+        label["effects"] = [{"effect": d.effect, "place": d.place, "parameters": d.parameters} for d in drawn]
+    else:
+        if row == "nothing missing":
+            for name in ("angle_noise", "current_noise", "voltage_noise"):
+                own[name] *= 3.0 ** rng.uniform(-1.0, 1.0)
+            own["angle_filter_tau"] *= rng.uniform(0.9, 1.1)
+            lost[1:-1] = rng.random(len(lost) - 2) < rng.choice([0.0, 0.01, 0.05, 0.2])
+            label["sensing"], label["lost"] = own, float(lost.mean())
+        if row == "closed loop" or (row == "nothing missing" and rng.random() < 0.3):
+            controller = CONTROLLERS[rng.integers(len(CONTROLLERS))](rng)
+        other = bool(rng.random() < 0.5)
+        rig = cases.Sizer(numbers, own, duty) if effects else None
+        goals = (4.0, 10.0) if row == "three effects" else cases.FLOORS
+        inside: dict[str, dict[str, float]] = {}
+        for effect in effects:
+            assert rig is not None
+            goal = math.exp(rng.uniform(*np.log(goals)))
+            entry, _ = cases.sized(effect, rig, goal, "other" if other else "table", nominal, rng)
+            draw = entry.pop("draw", 0)
+            label["effects"].append(entry)
+            parameters: dict[str, float] = entry["parameters"]  # type: ignore[assignment]
+            if effect == "parameter_mismatch":
+                numbers |= parameters
+            else:
+                inside[effect] = parameters
+            if effect == "gust":
+                gusts = plant.turbulence(parameters["sigma"], parameters["tau"], len(duty), other,
+                                         np.random.default_rng(draw))  # type: ignore[arg-type]
+        p = plant.packed(numbers, own["angle_filter_tau"], inside, {}, other)
+    y, v, applied = plant.states(p, duty, gusts, controller)
+    return label, {**plant.measured(p, y, v, own, rng), "duty": applied}, lost
+
+
+def plan(count: int, seed: int) -> list[tuple[str, list[str]]]:
+    """Circumstance and effects of each recording."""
+    rng = np.random.default_rng([seed, 23])
+    singles = [*EFFECTS, "parameter_mismatch"]
+    rows: list[tuple[str, list[str]]] = []
+    for row, part in ROWS.items():
+        for k in range(round(part * count)):
+            effects: list[str] = []
+            if row == "closed loop":
+                if k % len(singles) == 0:
+                    order = rng.permutation(singles)
+                effects = [str(order[k % len(singles)])]
+            elif row == "three effects":
+                while len({cases.PLACES[e] for e in effects}) < 3:
+                    effects = [str(e) for e in rng.choice(list(EFFECTS), 3, replace=False)]
+            rows.append((row, effects))
+    return rows
+
+
+def make_all(out: Path, count: int, seed: int, duration: float, jobs: int) -> None:
+    """Make the recordings, and seal their labels."""
+    nominal = load(MODEL)
+
+    def one(k: int, row: tuple[str, list[str]]) -> dict[str, Any]:
+        label, columns, lost = make(*row, nominal.model, nominal.sensing, seed * 100_019 + k, duration)
+        bags.write(out / "recordings" / f"c{k:03d}", columns, round(PERIOD * 1e9), lost)
+        return {"name": f"c{k:03d}", **label}
+
+    shutil.rmtree(out, ignore_errors=True)
+    (out / "recordings").mkdir(parents=True)
+    labels = Parallel(jobs)(delayed(one)(k, row) for k, row in enumerate(plan(count, seed)))
+    (out / SEALED).write_bytes(zlib.compress(json.dumps(labels).encode()))
+
+
+def diagnose_all(out: Path, jobs: int) -> None:
+    """Write a verdict for each recording; the labels stay sealed."""
+    model = load(MODEL)
+    (out / "verdicts").mkdir(exist_ok=True)
+
+    def one(path: Path) -> None:
+        started = time.perf_counter()
+        try:
+            result = diagnose(model, [signals_of(path, None, model.sensing)], 1)
+            body = to_json(document(result, [path.name], MODEL, time.perf_counter() - started))
+        except UserError as error:
+            body = {"error": str(error), "seconds": time.perf_counter() - started}
+        (out / "verdicts" / f"{path.name}.json").write_text(json.dumps(body))
+
+    Parallel(jobs)(delayed(one)(path) for path in sorted((out / "recordings").iterdir()))
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A recording with its label and its verdict.
+
+    Attributes:
+        label: as sealed.
+        answer: of the diagnosis.
+        shares: effect -> share of the gap as stated, and its 95 % interval, where there is one.
+    """
+
+    label: Mapping[str, Any]
+    answer: score.Answer
+    shares: Mapping[str, tuple[float, float, float]]
+
+    @property
+    def main(self) -> Mapping[str, Any] | None:
+        """The main effect of the recording, if it holds one."""
+        return next(iter(self.label["effects"]), None)
+
+    @property
+    def keys(self) -> set[str]:
+        """The keys of all effects in it."""
+        return {score.key_of(e["effect"], e["parameters"]) for e in self.label["effects"]}
+
+    @property
+    def first(self) -> bool:
+        """Whether the verdict is the main effect, or none where there is none."""
+        return self.answer.first == ("none" if self.main is None else
+                                     score.key_of(self.main["effect"], self.main["parameters"]))
+
+    @property
+    def placed(self) -> bool:
+        """Whether the place is that of the main effect."""
+        return self.main is not None and self.answer.place == self.main["place"]
+
+    @property
+    def main_share(self) -> float:
+        """Share of the main effect in the gap, where shares are known."""
+        return float(self.label["shares"].get(self.main["effect"], 0.0)) if self.main else 0.0
+
+    @property
+    def ghosts(self) -> int:
+        """Number of effects claimed that make less than `GHOST` of the gap, or none of it."""
+        return sum(self.label["shares"].get(score.id_of(key), 0.0) < GHOST for key in self.answer.found)
+
+    @property
+    def shares_held(self) -> list[bool]:
+        """For each effect claimed that is there: whether the interval of its share holds the true one."""
+        true = self.label["shares"]
+        return [low <= true[e] <= high for e, (_, low, high) in self.shares.items()
+                if e in true and e in self.answer.found]
+
+
+def judged(out: Path) -> list[Judged]:
+    """The recordings with labels and verdicts.
+
+    Raises:
+        SystemExit: a verdict is missing; the labels stay sealed until all are written.
+    """
+    names = sorted(p.name for p in (out / "recordings").iterdir())
+    missing = [n for n in names if not (out / "verdicts" / f"{n}.json").exists()]
+    if missing:
+        raise SystemExit(f"{len(missing)} of {len(names)} verdicts are missing ({missing[0]} ...): diagnose first")
+    found = []
+    for label in json.loads(zlib.decompress((out / SEALED).read_bytes())):
+        body = json.loads((out / "verdicts" / f"{label['name']}.json").read_text())
+        shares = {c["effect"]: (c["share"]["value"], c["share"]["low"], c["share"]["high"])
+                  for c in body.get("which", {}).get("candidates", ()) if c.get("share")}
+        found.append(Judged(label, score.answer_of_diagnosis(body), shares))
+    return found
+
+
+def figures(found: Sequence[Judged]) -> list[score.Figure]:
+    """The figures of all circumstances."""
+    rows = {row: [j for j in found if j.label["row"] == row] for row in ROWS}
+    half = [j for j in rows["messy"] if j.main_share >= 0.5]
+    seconds = [j.answer.seconds for j in found if j.answer.seconds is not None]
+    ghosts = [j.ghosts for j in rows["messy"]]
+    right, share = (lambda js: [j.first for j in js]), score.share
+    return [
+        share("messy, half of the gap or more: main effect first", right(half), at_least=0.92),
+        share("messy, half of the gap or more: place", [j.placed for j in half], at_least=0.96),
+        share("messy, less than half of the gap: main effect first",
+              right([j for j in rows["messy"] if j not in half])),
+        score.Figure("messy: ghosts a recording", float(np.mean(ghosts)) if ghosts else None, count=len(ghosts),
+                     at_most=0.15, share=False),
+        share("messy: 95 % interval of the share holds the true share",
+              [held for j in rows["messy"] for held in j.shares_held], at_least=0.90),
+        share("closed loop: right effect first", right(rows["closed loop"]), at_least=0.93),
+        share("nothing missing: an effect or `unknown` claimed",
+              [j.answer.first != "none" for j in rows["nothing missing"]], at_most=0.03),
+        share("three effects: all named", [j.keys <= set(j.answer.found) for j in rows["three effects"]],
+              at_least=0.85),
+        score.median("seconds, median", seconds, at_most=5.0),
+        score.Figure("seconds, longest", max(seconds, default=None), count=len(seconds), at_most=20.0, share=False),
+    ]
+
+
+def report(out: Path) -> list[score.Figure]:
+    """Print what was said of each recording, and the figures."""
+    found = judged(out)
+    for j in found:
+        true = [f"{e['effect']} {100 * j.label['shares'][e['effect']]:.0f} %" if j.label["shares"] else e["effect"]
+                for e in j.label["effects"]]
+        said = [f"{e} {100 * j.shares[score.id_of(e)][0]:.0f} %" if score.id_of(e) in j.shares else e
+                for e in j.answer.found]
+        print(f"{j.label['name']} {'+' if j.first else '-'} "
+              f"{j.label['row']:16} {', '.join(true[:3]) or 'nothing'} -> {j.answer.first} ({j.answer.place}): "
+              f"{', '.join(said)}; {j.answer.seconds:.1f} s")
+    made = figures(found)
+    for f in made:
+        print(f.line())
+    return made
