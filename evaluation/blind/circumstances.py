@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.document import to_json
@@ -48,6 +49,12 @@ SMALL = (0.2, 1.2)
 MAIN_SHARE = (0.2, 0.95)
 """Share of the gap that the main effect of a messy rig makes."""
 
+PART_OF_THREE = (0.03, 0.1)
+"""Gap, in spreads of the channels, that each of three effects makes."""
+
+LARGEST, LARGEST_SMALL = 1.5, 0.4
+"""Largest size of a main effect and of an imperfection, in sizes that `cases` starts from."""
+
 GHOST = 0.03
 """True share of the gap below which an effect that is claimed is not there."""
 
@@ -62,7 +69,8 @@ class Weighed(cases.Sizer):
         """What no refit of the numbers absorbs, (4, N), each channel in floors."""
         y, v, _ = plant.states(p, self.duty, gusts)
         moved = self.stack(plant.shown(p, y, v)) - self.base
-        return (moved - self.q @ (self.q.T @ moved)).reshape(len(self.floor), -1)
+        refit = lsq_linear(self.r, self.q.T @ moved, (-cases.OFF, cases.OFF)).x
+        return (moved - self.q @ (self.r @ refit)).reshape(len(self.floor), -1)
 
     def gap(self, rest: Array) -> Array:
         """The same over the spread of each channel: the mean square of all is the squared gap."""
@@ -88,11 +96,12 @@ class Drawn:
     gusts: Array
     rest: Array
 
-    def scaled(self, rig: Weighed, factor: float) -> Drawn:
-        """The effect at another size."""
+    def scaled(self, rig: Weighed, factor: float, most: float = LARGEST) -> Drawn:
+        """The effect at another size, at most one that a rig might have."""
         own = dict(self.parameters)
-        head = EFFECTS[self.effect][0] if self.effect in EFFECTS else "size"
+        head, start = _size(self.effect)
         neutral = 2.0 if head == "n" else 0.0
+        factor = min(factor, most * abs(start) / max(abs(own[head] - neutral), 1e-12))
         own[head] = neutral + factor * (own[head] - neutral)
         gusts = factor * self.gusts
         return Drawn(self.effect, self.place, own, gusts, rig.rest(_packed(rig, [(self.effect, own)]), gusts))
@@ -104,12 +113,18 @@ def _packed(rig: Weighed, effects: Sequence[tuple[str, Mapping[str, float]]]) ->
     return rig.packed(inside, outside, other=True)
 
 
+def _size(effect: str) -> tuple[str, float]:
+    """Name of the size of an effect, and where the search for a size starts."""
+    if effect in OUTSIDE:
+        return "size", OUTSIDE[effect][1]
+    head = EFFECTS[effect][0]
+    return head, cases.OWN_SIZES.get(effect, cases.SIZES.get(head, 1.0))
+
+
 def small(effect: str, rig: Weighed, rng: np.random.Generator) -> Drawn:
     """An imperfection of a messy rig: an effect in another form than the catalogue's, at a size of about a floor."""
     rest = cases.others(effect, rng) if effect in EFFECTS else {}
-    start = OUTSIDE[effect][1] if effect in OUTSIDE else cases.OWN_SIZES.get(
-        effect, cases.SIZES.get(EFFECTS[effect][0], 1.0))
-    head = EFFECTS[effect][0] if effect in EFFECTS else "size"
+    head, start = _size(effect)
     neutral = 2.0 if head == "n" else 0.0
     sign = float(rng.choice([-1.0, 1.0])) if effect in {"angle_offset", "current_offset", "voltage_offset",
                                                        "current_gain", "thrust_exponent"} else 1.0
@@ -120,7 +135,7 @@ def small(effect: str, rig: Weighed, rng: np.random.Generator) -> Drawn:
     place = OUTSIDE[effect][0] if effect in OUTSIDE else cases.PLACES[effect]
     drawn = Drawn(effect, place, own, gusts, rig.rest(_packed(rig, [(effect, own)]), gusts))
     goal = math.exp(rng.uniform(*np.log(SMALL)))
-    return drawn.scaled(rig, goal / max(_floors(drawn.rest), 1e-3))
+    return drawn.scaled(rig, goal / max(_floors(drawn.rest), 1e-3), LARGEST_SMALL)
 
 
 def _floors(rest: Array) -> float:
@@ -148,6 +163,22 @@ def messy(rng: np.random.Generator, numbers: Mapping[str, float], sensing: Mappi
         shares = {d.effect: 1.0 - float(np.mean((total - rig.gap(d.rest)) ** 2) / np.mean(total**2)) for d in all_}
         if shares[main] > MAIN_SHARE[0] and all(shares[main] > shares[d.effect] for d in background):
             return all_, shares
+
+
+def three(effects: Sequence[str], rng: np.random.Generator, numbers: Mapping[str, float],
+          sensing: Mapping[str, float], duty: Array) -> tuple[list[Drawn], dict[str, float]]:
+    """A rig with effects that make comparable parts of the gap; and the share of each."""
+    rig = Weighed(numbers, sensing, duty)
+    drawn = [small(e, rig, rng) for e in effects]
+    for k, d in enumerate(drawn):
+        goal = rng.uniform(*PART_OF_THREE)
+        for _ in range(4):
+            amount = float(np.mean(rig.gap(d.rest) ** 2))
+            d = d.scaled(rig, goal / max(math.sqrt(amount), 1e-6))
+        drawn[k] = d
+    total = np.sum([rig.gap(d.rest) for d in drawn], axis=0)
+    shares = {d.effect: 1.0 - float(np.mean((total - rig.gap(d.rest)) ** 2) / np.mean(total**2)) for d in drawn}
+    return drawn, shares
 
 
 def relay(rng: np.random.Generator) -> Callable[[float, float], float]:
@@ -206,8 +237,9 @@ def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing
     own = dict(sensing)
     lost = np.zeros(len(duty), dtype=bool)
     controller, gusts, other = None, np.zeros(0), True
-    if row == "messy":
-        drawn, label["shares"] = messy(rng, numbers, sensing, duty)
+    if row in {"messy", "three effects"}:
+        drawn, label["shares"] = (messy(rng, numbers, sensing, duty) if row == "messy" else
+                                  three(effects, rng, numbers, sensing, duty))
         p = _packed(Weighed(numbers, sensing, duty), [(d.effect, d.parameters) for d in drawn])
         gusts = next((d.gusts for d in drawn if len(d.gusts)), gusts)
         label["effects"] = [{"effect": d.effect, "place": d.place, "parameters": d.parameters} for d in drawn]
@@ -222,11 +254,10 @@ def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing
             controller = CONTROLLERS[rng.integers(len(CONTROLLERS))](rng)
         other = bool(rng.random() < 0.5)
         rig = cases.Sizer(numbers, own, duty) if effects else None
-        goals = (4.0, 10.0) if row == "three effects" else cases.FLOORS
         inside: dict[str, dict[str, float]] = {}
         for effect in effects:
             assert rig is not None
-            goal = math.exp(rng.uniform(*np.log(goals)))
+            goal = math.exp(rng.uniform(*np.log(cases.FLOORS)))
             entry, _ = cases.sized(effect, rig, goal, "other" if other else "table", nominal, rng)
             draw = entry.pop("draw", 0)
             label["effects"].append(entry)
@@ -251,13 +282,14 @@ def plan(count: int, seed: int) -> list[tuple[str, list[str]]]:
     for row, part in ROWS.items():
         for k in range(round(part * count)):
             effects: list[str] = []
+            scalable = [e for e in EFFECTS if e not in RANDOM_OR_STEPPED]
             if row == "closed loop":
                 if k % len(singles) == 0:
                     order = rng.permutation(singles)
                 effects = [str(order[k % len(singles)])]
             elif row == "three effects":
                 while len({cases.PLACES[e] for e in effects}) < 3:
-                    effects = [str(e) for e in rng.choice(list(EFFECTS), 3, replace=False)]
+                    effects = [str(e) for e in rng.choice(scalable, 3, replace=False)]
             rows.append((row, effects))
     return rows
 

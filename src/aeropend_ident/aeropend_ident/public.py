@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from aeropend_ident.bags.recording import Recording
 from aeropend_ident.diagnosis import diagnosis
 from aeropend_ident.diagnosis.diagnosis import Diagnosis
+from aeropend_ident.diagnosis.gap_share import MATERIAL_SHARE
 from aeropend_ident.identification import dataset
 from aeropend_ident.identification import identify as identification
 from aeropend_ident.identification.dataset import Dataset
@@ -18,7 +19,7 @@ from aeropend_sim.model.parameters import Model, load
 
 
 def diagnose(recordings: Recording | Sequence[Recording], model: Model | str = "bench", *, fit_nominal: bool = False,
-             held_out: float = 0.3, jobs: int = 1) -> Diagnosis:
+             held_out: float = 0.3, jobs: int = 1, material: float = MATERIAL_SHARE) -> Diagnosis:
     """Find where a model and a rig differ, which effect causes it, and how far the gap closes.
 
     Args:
@@ -27,6 +28,7 @@ def diagnose(recordings: Recording | Sequence[Recording], model: Model | str = "
         fit_nominal: whether the rig is uncalibrated.
         held_out: share at the end of each recording that nothing is fitted to.
         jobs: threads; the result does not depend on them.
+        material: share of the gap from which an effect is claimed.
 
     Raises:
         RecordingError: no verdict is possible; one line that says why.
@@ -35,7 +37,7 @@ def diagnose(recordings: Recording | Sequence[Recording], model: Model | str = "
     model = load(model) if isinstance(model, str) else model
     several = [recordings] if isinstance(recordings, Recording) else list(recordings)
     signals = [as_signals(r, model.sensing, held_out, fit_nominal=fit_nominal) for r in several]
-    return diagnosis.diagnose(model, signals, jobs, fit_nominal=fit_nominal)
+    return diagnosis.diagnose(model, signals, jobs, fit_nominal=fit_nominal, material=material)
 
 
 def identify(data: Recording | Dataset, method: str = "weak", *, model: Model | str = "bench",

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.gap_share import MATERIAL_SHARE
 from aeropend_ident.diagnosis.results import document, verdict_lines
 from aeropend_ident.signals.signals import from_arrays
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, recorded, steps
@@ -68,8 +69,47 @@ def test_friction_and_a_curve_of_thrust_are_found_to_a_part_in_a_thousand():
 def test_the_effect_that_opens_more_of_the_gap_comes_first(friction, drop, first):
     effects = {"coulomb_friction": {"accel": friction}, "brush_drop": {"v_brush": drop}}
     body = diagnose(BENCH, [recorded(71, effects)], 2).body
-    assert set(body["which"]["effects"]) == set(effects)
+    assert {*body["which"]["effects"], *body["which"].get("small", [])} == set(effects)
     assert body["which"]["verdict"] == body["which"]["effects"][0] == first
+    shares = [candidate(body, effect)["share"]["value"] for effect in effects]
+    assert shares[list(effects).index(first)] == max(shares)
+    assert sum(shares) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.promise("Verdict", "An effect is claimed if its share of the gap is material; smaller ones are listed")
+def test_an_effect_that_makes_little_of_the_gap_is_small_unless_a_person_asks_for_it():
+    signals = recorded(71, {"coulomb_friction": {"accel": 0.2}, "brush_drop": {"v_brush": 0.8}})
+    usual, strict = (diagnose(BENCH, [signals], 2, material=m).conclusions.which for m in (MATERIAL_SHARE, 0.0))
+    assert (usual.effects, usual.small) == (("brush_drop",), ("coulomb_friction",))
+    assert (strict.effects, strict.small) == (("brush_drop", "coulomb_friction"), ())
+    assert [c.effect for c in usual.candidates if c.found] == ["brush_drop"]
+
+
+@pytest.mark.promise("Verdict", "The numbers of the measurement chain have tolerances")
+@pytest.mark.parametrize("factor", [0.9, 1.1])
+def test_a_filter_within_its_tolerance_is_no_effect(factor):
+    signals = filtered(factor)
+    body = diagnose(BENCH, [signals], 2).body
+    assert body["which"]["verdict"] == "none"
+    row = body["which"]["numbers"]["sensing.angle_filter_tau"]
+    assert row["low"] < factor * BENCH.sensing["angle_filter_tau"] < row["high"]
+
+
+@pytest.mark.promise("Verdict", "The numbers of the measurement chain have tolerances")
+def test_a_filter_that_is_much_faster_is_a_negative_lag():
+    body = diagnose(BENCH, [filtered(0.2)], 2).body
+    assert body["which"]["verdict"] == "encoder_lag"
+    tau = candidate(body, "encoder_lag")["parameters"]["tau"]
+    assert tau["low"] < -0.8 * BENCH.sensing["angle_filter_tau"] < tau["high"] < 0.0
+
+
+def filtered(factor):
+    """A recording of a rig whose filter has another time constant than the model file states; fine resolution."""
+    sensing = {**BENCH.sensing, "angle_filter_tau": factor * BENCH.sensing["angle_filter_tau"], "angle_lsb": 1e-4,
+               "angle_noise": 2e-4}
+    duty = steps(40.0, 74)
+    columns, _ = rig.record(Model("rig", BENCH.model, sensing), duty, 74)
+    return from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, {**BENCH.sensing, "angle_lsb": 1e-4})
 
 
 @pytest.mark.promise("Verdict", "Several effects are found; the one with the largest share of the gap comes first")
@@ -182,6 +222,7 @@ def test_what_is_held_out_moves_no_fit():
                     for c in (columns, spoilt))
     for one in (*whole["which"]["candidates"], *other["which"]["candidates"]):
         one.pop("gap_after")
+        one.pop("share", None)  # measured on what is held out
     assert whole["which"]["effects"] == ["coulomb_friction"]
     assert other["which"] == whole["which"]
     assert other["shrink"]["gap_after"] > 2.0 * whole["shrink"]["gap_after"]

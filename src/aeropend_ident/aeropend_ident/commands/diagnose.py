@@ -24,6 +24,7 @@ from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.diagnosis import batch, dask_cluster
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.document import Across
+from aeropend_ident.diagnosis.gap_share import MATERIAL_SHARE
 from aeropend_ident.diagnosis.results import FILES, Results, document
 from aeropend_ident.diagnosis.validation import validate
 from aeropend_ident.result_folder import ensure_free, folder_names
@@ -74,6 +75,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--fit-nominal", "--uncalibrated", action="store_true",
                         help="the parameters of the rig are not known: identify its nominal model from the recordings "
                              "first; the command may be missing if the arm swings freely")
+    parser.add_argument("--material", type=between(0.0, 1.0, "a share"), default=MATERIAL_SHARE, metavar="SHARE",
+                        help="share of the gap from which an effect is claimed; smaller ones are listed as small "
+                             f"(default: {MATERIAL_SHARE:g})")
     parser.add_argument("--overwrite", action="store_true", help="replace results in the folder")
     options = parser.parse_args(arguments)
     if options.dask is not None and not options.each:
@@ -109,7 +113,7 @@ def run(options: argparse.Namespace, command: str) -> None:
         signals, tests = ([signals_of(bag, options.namespace, model.sensing, options.held_out,
                                       fit_nominal=options.fit_nominal) for bag in bags]
                           for bags in (options.bags, options.test))
-        found = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal,
+        found = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal, material=options.material,
                          progress=lambda what, share: show(share, what))
         shown = [Across(bag, **vars(validate(found.model, found.augmented, s))) for bag, s in zip(options.test, tests)]
         made = document(found, options.bags, options.model, time.monotonic() - started, shown)
@@ -132,7 +136,7 @@ def run_each(options: argparse.Namespace) -> None:
     for name in names:
         ensure_free(out / name, FILES, overwrite=options.overwrite)
     settings = batch.Settings(load(options.model), options.model, options.namespace, options.held_out,
-                             options.fit_nominal)
+                             options.fit_nominal, options.material)
     commands = [_alone(options, bag, out / name) for bag, name in zip(options.bags, names)]
     rows = []
     try:
@@ -164,6 +168,7 @@ def _alone(options: argparse.Namespace, bag: str, out: Path) -> str:
     """The command that gives the verdict of one recording of a batch."""
     words = ["diagnose", bag, "--out", str(out), "--model", options.model, "--held-out", f"{options.held_out:g}"]
     words += ["--namespace", options.namespace] if options.namespace is not None else []
+    words += ["--material", f"{options.material:g}"] if options.material != MATERIAL_SHARE else []
     return shlex.join(words + ["--fit-nominal"] * options.fit_nominal)
 
 

@@ -21,6 +21,7 @@ from threadpoolctl import threadpool_limits
 from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.diagnosis import dask_cluster
 from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.gap_share import MATERIAL_SHARE
 from aeropend_ident.diagnosis.results import Results, document
 from aeropend_ident.result_folder import OutputError, on_interrupt
 from aeropend_ident.signals.from_bag import signals_of
@@ -44,6 +45,7 @@ class Settings:
         namespace: of the rig, if a bag holds several.
         held_out: share of each recording that nothing is fitted to.
         fit_nominal: whether the rigs are uncalibrated.
+        material: share of the gap from which an effect is claimed.
     """
 
     model: Model
@@ -51,6 +53,7 @@ class Settings:
     namespace: str | None = None
     held_out: float = 0.3
     fit_nominal: bool = False
+    material: float = MATERIAL_SHARE
 
 
 @dataclass(frozen=True)
@@ -143,7 +146,8 @@ def _examine(task: _Task) -> Outcome:
     # never lifted: threads of one worker share the limit
     threadpool_limits(1)
     try:
-        found = diagnose(task.settings.model, [task.signals], 1, fit_nominal=task.settings.fit_nominal)
+        found = diagnose(task.settings.model, [task.signals], 1, fit_nominal=task.settings.fit_nominal,
+                         material=task.settings.material)
         made = document(found, [task.bag], task.settings.name, task.reading + time.monotonic() - started)
         return Outcome(task.bag, Results.of(found, made, task.command))
     except Exception as error:

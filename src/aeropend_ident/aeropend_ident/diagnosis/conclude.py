@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from aeropend_ident.diagnosis import experiment_design
 from aeropend_ident.diagnosis.chain import nominal_fit
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import OF_THE_ARM, UNCALIBRATED_SD, ZERO, basis, model_parameters
-from aeropend_ident.diagnosis.chain.values import STAGES, neutral, of_rig, with_values
+from aeropend_ident.diagnosis.chain.values import FILTER, STAGES, neutral, of_rig, with_values
 from aeropend_ident.diagnosis.document import (
     Candidate,
     HangingAngle,
@@ -23,11 +23,12 @@ from aeropend_ident.diagnosis.document import (
     ParameterRow,
 )
 from aeropend_ident.diagnosis.free_run_gap import HeldOut
-from aeropend_ident.diagnosis.joint_fit import Z95, JointFit
+from aeropend_ident.diagnosis.joint_fit import JointFit
 from aeropend_ident.diagnosis.policy import CALIBRATED, angle_only
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.signals import Signals
+from aeropend_ident.signals.statistics import Z95
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import MODEL_NAMES, PARAMETERS, Model
 
@@ -63,7 +64,8 @@ def parameter_rows(chains: CutChains, joint: JointFit) -> dict[str, ParameterRow
     """
     nominal, values, sd = chains.model.model, joint.values, joint.sd
     if chains.policy.calibrated:
-        return {n: _row(nominal[n], _interval(values[n], sd[n])) for n in MODEL_NAMES if n in values}
+        return {n: _row(neutral(chains.model, n), _interval(values[n], sd[n])) for n in (*MODEL_NAMES, FILTER)
+                if n in values}
     fitted = {p.name: p for stage in STAGES for p in model_parameters(chains, stage)}
     alone = angle_only(chains.recordings)
     rows: dict[str, ParameterRow] = {}
@@ -133,19 +135,20 @@ def identified_model(chains: CutChains, joint: JointFit, rows: Mapping[str, Para
     return Identified(basis(recordings), tuple(n for n, row in rows.items() if not row.determined), lift, hangs)
 
 
-def candidates(findings: Mapping[str, Findings], joint: JointFit, statistical: Statistical, held_out: HeldOut,
-               gap_after: float) -> tuple[Candidate, ...]:
+def candidates(joint: JointFit, statistical: Statistical, held_out: HeldOut, gap_after: float,
+               claimed: Container[str], share: Mapping[str, Interval]) -> tuple[Candidate, ...]:
     """Every hypothesis that was ranked, the most probable first; a found one with its intervals of the joint fit.
 
     Args:
-        findings: stage -> what is claimed, with all selections.
         joint: the joint fit.
         statistical: effects that were detected by their statistics.
         held_out: measures gaps.
         gap_after: gap of the augmented model.
+        claimed: names of the hypotheses that are part of the verdict.
+        share: name -> share of the gap.
     """
     rows: dict[str, Candidate] = {}
-    for f in findings.values():
+    for f in joint.findings.values():
         accepted = {h.name for h in f.effects}
         for selection in f.selections:
             for r in selection:
@@ -159,11 +162,13 @@ def candidates(findings: Mapping[str, Findings], joint: JointFit, statistical: S
                 whole = {**joint.values, **r.fit.values}
                 estimates = {key(p.name).name: _interval(source[p.name], spread[p.name], p.low, p.high) for p in h.own}
                 after = gap_after if mine else held_out.gap_of(whole).total if r.probability > TRACE else None
-                rows[h.name] = Candidate(h.effect, h.place, r.probability, estimates, mine, after)
+                rows[h.name] = Candidate(h.effect, h.place, r.probability, estimates, h.name in claimed, after,
+                                         share.get(h.name) if mine else None)
     for extra in statistical.found:
         h = extra.hypothesis
         estimates = {key(n).name: _interval(v, extra.fit.sd[n], 0.0) for n, v in extra.fit.values.items()}
-        rows[h.name] = Candidate(h.effect, h.place, extra.probability, estimates, True, gap_after)
+        rows[h.name] = Candidate(h.effect, h.place, extra.probability, estimates, h.name in claimed, gap_after,
+                                 share.get(h.name))
     return tuple(sorted(rows.values(), key=lambda row: -row.probability))
 
 

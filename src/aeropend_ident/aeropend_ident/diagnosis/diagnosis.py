@@ -15,30 +15,25 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from aeropend_ident.diagnosis import conclude, regions, typed_json
+from aeropend_ident.diagnosis import conclude, gap_share, regions, typed_json
 from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model
 from aeropend_ident.diagnosis.chain.pwm_timing import with_pwm_timing
-from aeropend_ident.diagnosis.chain.values import PLACE_OF_CHANNEL, PLACE_OF_PARAMETER, neutral, of_rig, with_values
+from aeropend_ident.diagnosis.chain.values import PLACE_OF_PARAMETER, neutral, of_rig, with_values
 from aeropend_ident.diagnosis.conclude import Statistical
-from aeropend_ident.diagnosis.document import (
-    Channel,
-    Closure,
-    Conclusions,
-    Curve,
-    Residual,
-    UnknownEffect,
-    Where,
-    Which,
-)
+from aeropend_ident.diagnosis.document import Channel, Closure, Conclusions, Curve, Residual, Where, Which
+from aeropend_ident.diagnosis.document import UnknownEffect as DrawnEffect
 from aeropend_ident.diagnosis.experiment_design import EXPERIMENTS, experiments_within
 from aeropend_ident.diagnosis.free_run_gap import Gap, HeldOut, closure
+from aeropend_ident.diagnosis.gap_share import MATERIAL_SHARE, Part
 from aeropend_ident.diagnosis.joint_fit import JointFit, fit_jointly
 from aeropend_ident.diagnosis.policy import GOOD_ENOUGH, policy_of
 from aeropend_ident.diagnosis.search import gust, speed_spikes, unknown_effect
 from aeropend_ident.diagnosis.search.findings import Findings
+from aeropend_ident.diagnosis.search.free_curves import MissingTerm
 from aeropend_ident.diagnosis.search.search import refit, search
+from aeropend_ident.diagnosis.search.unknown_effect import UnknownEffect
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import CHANNELS, Signals
 from aeropend_ident.signals.statistics import rms
@@ -83,7 +78,7 @@ Progress = Callable[[str, float], None]
 
 
 def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progress: Progress = lambda *_: None, *,
-             fit_nominal: bool = False) -> Diagnosis:
+             fit_nominal: bool = False, material: float = MATERIAL_SHARE) -> Diagnosis:
     """Find where a model and a rig differ, which effect causes it, and how far the gap closes.
 
     Args:
@@ -92,6 +87,7 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
         jobs: threads; the result does not depend on them.
         progress: called as the work goes on.
         fit_nominal: whether the rig is uncalibrated: its parameters are known to a factor of three at best.
+        material: share of the gap from which an effect is claimed.
     """
     with threadpool_limits(1):  # the matrices are narrow: threads of the linear algebra would slow each other down
         if fit_nominal:
@@ -99,7 +95,20 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
             model, recordings = fit_nominal_model(model, recordings)
         policy = policy_of(recordings, fit_nominal=fit_nominal)
         kind = CutChains if policy.calibrated else CachedChains
-        return _diagnose(with_pwm_timing(kind(model, recordings, policy)), jobs, progress)
+        return _diagnose(with_pwm_timing(kind(model, recordings, policy)), Settings(jobs, material), progress)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a person may set.
+
+    Attributes:
+        jobs: threads.
+        material: share of the gap from which an effect is claimed.
+    """
+
+    jobs: int = 1
+    material: float = MATERIAL_SHARE
 
 
 @dataclass(frozen=True)
@@ -118,7 +127,7 @@ class _Findings:
     chains: CutChains
     stages: Mapping[str, Findings]
     statistical: Statistical
-    unknown: unknown_effect.UnknownEffect | None
+    unknown: UnknownEffect | None
     misfit: regions.Misfit
     recordings: Sequence[Signals]
 
@@ -146,20 +155,45 @@ class _Gaps:
     floors: Mapping[str, float]
 
 
-def _diagnose(fitted: CutChains, jobs: int, progress: Progress) -> Diagnosis:
+def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diagnosis:
     """The steps after the chain is cut; `fitted`: the chains whose training part parameters are fitted to."""
-    found = _find(fitted, jobs, progress)
+    found = _find(fitted, settings.jobs, progress)
     progress("fitting all jointly", 0.75)
-    joint = fit_jointly(found.chains, found.stages, gust=found.statistical.gust is not None)
-    found = replace(found, stages=joint.findings)
-    progress("measuring the gap", 0.9)
-    gaps = _measure(fitted, found, joint)
-    conclusions = _conclude(found, joint, gaps)
+    found, joint, gaps = _fit_and_measure(fitted, found, progress)
+    if found.unknown is not None and gaps.after.within(gaps.floors):
+        found = replace(found, unknown=None)
+    parts = _parts(found, joint, gaps, settings.jobs)
+    if found.unknown is not None and _approximated(found.unknown, joint, gaps, parts):
+        stages = {b: f.nothing() if b in found.unknown.instead else f for b, f in found.stages.items()}
+        found, joint, gaps = _fit_and_measure(fitted, replace(found, stages=stages), progress)
+        parts = _parts(found, joint, gaps, settings.jobs)
+    conclusions = _conclude(found, joint, gaps, parts, settings)
     model, chains = found.chains.model, found.chains
     nominal = model if chains.policy.calibrated else with_values(model, of_rig(gaps.base))
     progress("done", 1.0)
     return Diagnosis(nominal, _augmented(model, joint.values, found.statistical), found.recordings, gaps.runs_before,
                      gaps.runs_after, conclusions, found.misfit)
+
+
+def _fit_and_measure(fitted: CutChains, found: _Findings, progress: Progress) -> tuple[_Findings, JointFit, _Gaps]:
+    """Fit all that was found jointly, and measure the gap before and after; the findings are those still claimed."""
+    progress("fitting all jointly", 0.75)
+    joint = fit_jointly(found.chains, found.stages, gust=found.statistical.gust is not None)
+    found = replace(found, stages=joint.findings)
+    progress("measuring the gap", 0.9)
+    return found, joint, _measure(fitted, found, joint)
+
+
+def _approximated(unknown: UnknownEffect, joint: JointFit, gaps: _Gaps, parts: Sequence[Part]) -> bool:
+    """Whether effects found only approximate an unknown one whose part of the gap, theirs included, is the largest."""
+    effects = [h for b in unknown.instead for h in joint.findings[b].effects]
+    if not effects:
+        return False
+    theirs = gap_share.part_of_several(effects, joint, gaps.held_out.in_motion(), unknown.term.place)
+    names = {h.name for h in effects}
+    rest = sum(p.amount for p in parts if p.name == gap_share.UNKNOWN)
+    others = [p.amount for p in parts if p.name and p.name not in {*names, gap_share.UNKNOWN}]
+    return theirs.amount + rest > max(others, default=0.0)
 
 
 def _find(fitted: CutChains, jobs: int, progress: Progress) -> _Findings:
@@ -175,7 +209,7 @@ def _find(fitted: CutChains, jobs: int, progress: Progress) -> _Findings:
     detected = gust.detect(chains, stages["arm"])
     stages = {**stages, "arm": detected.arm}
     misfit = regions.largest_misfit(chains, stages)
-    unknown, stages = unknown_effect.judge(chains, stages, gust=detected.gust is not None, spikes=spikes is not None)
+    unknown = unknown_effect.judge(chains, stages, gust=detected.gust is not None, spikes=spikes is not None)
     return _Findings(chains, stages, Statistical(detected.gust, spikes), unknown, misfit, recordings)
 
 
@@ -195,80 +229,63 @@ def _measure(fitted: CutChains, found: _Findings, joint: JointFit) -> _Gaps:
                  held_out.floors())
 
 
-def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps) -> Conclusions:
+def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Part], settings: Settings
+              ) -> Conclusions:
     """What the findings, the joint fit and the gaps show."""
-    chains, stages, unknown = found.chains, found.stages, found.unknown
+    chains, stages, unknown = found.chains, joint.findings, found.unknown
     calibrated = chains.policy.calibrated
-    candidates = conclude.candidates(stages, joint, found.statistical, gaps.held_out, gaps.after.total)
-    amounts = _amounts(found, joint.values, gaps)
-    verdict, place, effects = _verdict(amounts, unknown)
+    share = gap_share.shares(parts)
+    head = gap_share.headline(parts, share, settings.material)
+    candidates = conclude.candidates(joint, found.statistical, gaps.held_out, gaps.after.total, head.claimed, share)
     reasons = [f"{c} is off by {x:.1f} times a reading's noise"
                for c, x in _left(stages, gust=found.statistical.gust is not None).items() if x > GOOD_ENOUGH]
     undecided = conclude.not_separable(stages, chains.policy.undecided)
     tried = EXPERIMENTS if calibrated else experiments_within(max(float(s.duty.max()) for s in found.recordings))
     rows = conclude.parameter_rows(chains, joint)
-    share, low, high = closure(gaps.before, gaps.after, gaps.floors)
+    closed, low, high = closure(gaps.before, gaps.after, gaps.floors)
+    places = gap_share.share_of_places(parts, lambda: _parts_of_parameters(joint, gaps))
     return Conclusions(
         channels={c: Channel(CHANNELS[c], gaps.before.rms[c], gaps.floors[c], gaps.after.rms[c])
                   for c in CHANNELS if c in gaps.before.rms},
-        where=Where(place, regions.shares((p, amount) for _, p, amount in amounts),
-                    tuple(regions.regions(found.misfit))),
-        which=Which(verdict, tuple(effects), candidates, rows,
+        where=Where(head.place, regions.shares(places), tuple(regions.regions(found.misfit))),
+        which=Which(head.verdict, tuple(head.effects), candidates, rows,
                     {channel: Residual(check.rms[channel], check.white[channel], check.dependence)
                      for check in joint.checks.values() for channel in check.rms},
-                    tuple(reasons), None if unknown is None else _curves(unknown),
+                    tuple(reasons), None if unknown is None else _curves(unknown.term),
                     tuple(conclude.names(a, b) for a, b in undecided),
-                    conclude.next_experiment(chains.model, found.recordings[0], undecided, joint.values, tried)),
-        closure=Closure(gaps.before.total, gaps.after.total, gaps.before.total_floor(gaps.floors), share, low, high),
+                    conclude.next_experiment(chains.model, found.recordings[0], undecided, joint.values, tried),
+                    tuple(head.small)),
+        closure=Closure(gaps.before.total, gaps.after.total, gaps.before.total_floor(gaps.floors), closed, low, high),
         identified=None if calibrated else conclude.identified_model(chains, joint, rows))
 
 
-def _verdict(amounts: Sequence[tuple[str, str, float]], unknown: unknown_effect.UnknownEffect | None
-             ) -> tuple[str, str, list[str]]:
-    """The verdict, its place, and the effects found, the largest first."""
-    ranked = sorted((a for a in amounts if a[0]), key=lambda a: -a[2])
-    effects = list(dict.fromkeys(name.partition(":")[0] for name, _, _ in ranked))
-    if unknown is not None and (unknown.first or not effects):
-        return "unknown", unknown.term.place, effects
-    return (effects[0], ranked[0][1], effects) if ranked else ("none", "none", effects)
+def _curves(term: MissingTerm) -> DrawnEffect:
+    return DrawnEffect(term.place, tuple(
+        Curve(c.variable, c.unit, tuple(c.knot.tolist()), tuple(c.value.tolist())) for c in term.curves))
 
 
-def _curves(unknown: unknown_effect.UnknownEffect) -> UnknownEffect:
-    return UnknownEffect(unknown.term.place, tuple(
-        Curve(c.variable, c.unit, tuple(c.knot.tolist()), tuple(c.value.tolist())) for c in unknown.term.curves))
+def _parts(found: _Findings, joint: JointFit, gaps: _Gaps, jobs: int) -> list[Part]:
+    """The parts of the gap: of each effect, and of what stays unexplained."""
+    held_out, statistical = gaps.held_out.in_motion(), found.statistical
+    parts = gap_share.parts_of_effects(joint, held_out, jobs)
+    parts += gap_share.unexplained(held_out.gap(gaps.runs_after), gaps.floors, statistical.gust,
+                                   None if found.unknown is None else found.unknown.term.place)
+    if statistical.spikes is not None:  # they are few: the held-out part may hold none
+        whole = gaps.held_out.everywhere()
+        parts.append(gap_share.part_of_spikes(statistical.spikes, whole.gap(gaps.runs_before, known=False),
+                                              whole.gap(gaps.runs_before)))
+    return parts
 
 
-def _amounts(found: _Findings, values: Mapping[str, float], gaps: _Gaps) -> list[tuple[str, str, float]]:
-    """Name, place and squared gap of each finding: the gap that comes back when it is taken out.
-
-    Entries without a name are no findings: what stays unexplained at a place; if there is neither, the share of each
-    place in the gap that nominal parameters leave.
-    """
-    held_out, statistical = gaps.held_out, found.statistical
-    best = held_out.gap_of(values).total ** 2
-    unexplained = _unexplained(found.stages, gaps.after, gaps.floors)
-    if found.unknown is not None and unexplained:
-        unexplained = {found.unknown.term.place: sum(unexplained.values())}
-
-    def comes_back(nominal: Mapping[str, float]) -> float:
-        return max(held_out.gap_of({**values, **nominal}).total ** 2 - best, 0.0)
-
-    effects = [h for f in found.stages.values() for h in f.effects]
-    amounts = [(h.name, h.place, comes_back({p.name: neutral(held_out.model, p.name) for p in h.own}))
-               for h in effects]
-    if statistical.gust is not None:
-        h = statistical.gust.hypothesis
-        amounts.append((h.name, h.place, unexplained.pop("arm", 0.0)))
-    if statistical.spikes is not None:
-        h = statistical.spikes.hypothesis
-        with_, without = held_out.gap(gaps.runs_before, known=False), held_out.gap(gaps.runs_before)
-        amounts.append((h.name, h.place, max(with_.total**2 - without.total**2, 0.0)))
-    amounts += [("", place, amount) for place, amount in unexplained.items()]
-    if not amounts:
-        for place in dict.fromkeys(PLACE_OF_PARAMETER.values()):
-            back = {n: held_out.model.model[n] for n in values if PLACE_OF_PARAMETER.get(n) == place}
-            amounts.append(("", place, comes_back(back)))
-    return amounts
+def _parts_of_parameters(joint: JointFit, gaps: _Gaps) -> list[Part]:
+    """The part of each place in the gap that nominal parameters leave."""
+    held_out = gaps.held_out
+    parts = []
+    for place in dict.fromkeys(PLACE_OF_PARAMETER.values()):
+        back = {n: neutral(held_out.model, n) for n in joint.values if PLACE_OF_PARAMETER.get(n) == place}
+        parts.append(Part("", place, held_out.gap_of({**joint.values, **back}).total ** 2 - gaps.after.total**2,
+                          np.zeros(0)))
+    return parts
 
 
 def _left(findings: Mapping[str, Findings], *, gust: bool) -> dict[str, float]:
@@ -279,18 +296,6 @@ def _left(findings: Mapping[str, Findings], *, gust: bool) -> dict[str, float]:
             if not (gust and stage == "arm"):
                 name = key(channel).name
                 left[name] = max(left.get(name, 0.0), rms(r))
-    return left
-
-
-def _unexplained(findings: Mapping[str, Findings], after: Gap, floors: Mapping[str, float]) -> dict[str, float]:
-    """Place -> squared gap that its channel keeps above the floor in the cut chain."""
-    left: dict[str, float] = {}
-    for f in findings.values():
-        for channel, r in f.final.residuals.items():
-            name = key(channel).name
-            excess = float(np.mean(r * r)) - GOOD_ENOUGH**2
-            if excess > 0.0 and name in after.spread:
-                left[PLACE_OF_CHANNEL[name]] = excess * (floors[name] / after.spread[name]) ** 2 / len(after.spread)
     return left
 
 

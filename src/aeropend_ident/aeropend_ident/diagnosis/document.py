@@ -103,6 +103,7 @@ class Candidate:
         parameters: name -> estimate of each of its parameters.
         found: whether it is part of the verdict.
         gap_after: [share of the spread] total gap with it; null if it was not computed.
+        share: [0..1] its share of the gap, which comes back without it; null if it is not in the augmented model.
     """
 
     effect: str
@@ -111,6 +112,7 @@ class Candidate:
     parameters: Mapping[str, Interval]
     found: bool
     gap_after: float | None
+    share: Interval | None = None
 
 
 @dataclass(frozen=True)
@@ -217,7 +219,8 @@ class Which:
 
     Attributes:
         verdict: id of the effect with the largest share, "parameter_mismatch", "none" or "unknown".
-        effects: ids of all effects found, the largest share first.
+        effects: ids of all effects claimed, the largest share first.
+        small: ids of effects in the augmented model whose share of the gap is too small to be claimed.
         candidates: the ranked hypotheses, the most probable first.
         numbers: name -> refitted parameter of the model.
         residuals: channel -> tests of its residuals.
@@ -236,6 +239,7 @@ class Which:
     unknown: UnknownEffect | None
     not_separable: tuple[tuple[str, str], ...]
     next_experiment: NextExperiment | None
+    small: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,9 @@ RESAMPLES = 2000
 AT_REST = 0.05
 """Share of its spread over the whole recording below which a channel rests on held-out data (choice)."""
 
+STILL_ARM = 0.3
+"""Share of its standard deviation over the recording below which the arm rests on held-out data (choice)."""
+
 FEWEST = 10
 """Readings of a channel below which it has no gap (choice)."""
 
@@ -100,6 +103,11 @@ class Gap:
     def total_floor(self, floors: Mapping[str, float]) -> float:
         """The same of floors by channel: the total gap of a perfect model."""
         return float(np.sqrt(np.mean([(floors[c] / self.spread[c]) ** 2 for c in self.rms])))
+
+
+    def within(self, floors: Mapping[str, float]) -> bool:
+        """Whether no channel has a gap above its floor that could be closed."""
+        return all(self.rms[c] <= (1.0 + NOTHING_OPEN) * floors[c] for c in self.rms)
 
 
 def gap(readings: Mapping[str, Array], signals: Signals, start: int, stop: int,
@@ -193,10 +201,22 @@ class HeldOut:
         model: the nominal model.
         recordings: of one rig.
         spikes: whether `speed_spikes` was detected: false captures then do not count.
+        whole: whether to measure on the whole recordings instead.
     """
 
-    def __init__(self, chains: CutChains, model: Model, recordings: Sequence[Signals], *, spikes: bool) -> None:
+    def __init__(self, chains: CutChains, model: Model, recordings: Sequence[Signals], *, spikes: bool,
+                 whole: bool = False) -> None:
         self.chains, self.model, self.recordings, self.spikes = chains, model, recordings, spikes
+        self.whole = whole
+
+    def in_motion(self) -> HeldOut:
+        """The same, on the whole recordings if an arm rests in its held-out part, where no effect would show."""
+        rests = any(np.nanstd(s.theta[s.train:]) < STILL_ARM * np.nanstd(s.theta) for s in self.recordings)
+        return self.everywhere() if rests else self
+
+    def everywhere(self) -> HeldOut:
+        """The same on the whole recordings."""
+        return HeldOut(self.chains, self.model, self.recordings, spikes=self.spikes, whole=True)
 
     def runs(self, values: Mapping[str, float]) -> list[dict[str, Array]]:
         """Free runs of the model with these values, one a recording."""
@@ -209,7 +229,7 @@ class HeldOut:
             readings: of a model, one a recording.
             known: whether false captures, if detected, are left out.
         """
-        gaps = [gap(r, s, s.train, len(s), s.false_speed if known and self.spikes else None)
+        gaps = [gap(r, s, 0 if self.whole else s.train, len(s), s.false_speed if known and self.spikes else None)
                 for r, s in zip(readings, self.recordings, strict=True)]
         if len(gaps) == 1:
             return gaps[0]

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,25 +14,17 @@ from aeropend_ident.diagnosis import free_run_gap
 from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains, difference
 from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD, nominal_parameters
 from aeropend_ident.diagnosis.chain.values import neutral
+from aeropend_ident.diagnosis.policy import CERTAIN
 from aeropend_ident.diagnosis.search.findings import Findings, Selection
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
-from aeropend_ident.diagnosis.search.search import refit
-from aeropend_ident.estimation.map_fit import fit
+from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
+from aeropend_ident.diagnosis.search.search import refit, within_prior
+from aeropend_ident.estimation.map_fit import Fit, fit
 from aeropend_ident.estimation.parameter import Parameter, started
-from aeropend_ident.signals.statistics import rms
+from aeropend_ident.signals.statistics import Z95, rms
 from aeropend_sim.model.parameters import Model
 
 Array = NDArray[np.float64]
-
-Z95 = 1.959964
-"""Standard deviations of a normal distribution on either side of its mean that hold 95 % (derived)."""
-
-CERTAIN = 15.0
-"""Log evidence above which an effect of an uncalibrated rig is claimed however uncertain its size is.
-
-Choice: odds of 3·10⁶.
-
-Measured: at ±30 % no verdict of 14 recordings changes (docs/results/thresholds.md)."""
 
 SURE = 2.5
 """Standard deviations by which an effect must differ from none, and a parameter from nominal, after the joint fit.
@@ -45,6 +37,10 @@ WIDER = 1.2
 """Factor on the standard deviations of a fit, since its inputs are measured too and quantisation is not white.
 
 Measured: rigs simulated for the purpose (seeds 11 to 13 of `make blind`); intervals are judged on others."""
+
+
+AGAIN_ROUNDS = 3
+"""Rounds of a fit without one of the effects (choice: it starts close to its end, and only its gap counts)."""
 
 
 @dataclass(frozen=True)
@@ -69,16 +65,48 @@ class JointFit:
     """The joint fit of everything found.
 
     Attributes:
+        chains: that were fitted.
         findings: stage -> what is still claimed after it.
+        fit: of everything.
         values: name -> estimate.
         sd: name -> standard deviation, with the uncertainty from the form of an effect.
         checks: stage -> tests of what is left of it.
     """
 
+    chains: CutChains
     findings: dict[str, Findings]
+    fit: Fit
     values: dict[str, float]
     sd: dict[str, float]
     checks: dict[str, Check]
+
+    def without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
+        """The values that fit best without some of the effects; calibrated parameters stay within their priors."""
+        rest = {stage: replace(f, found=tuple(s for s in f.found if s[0].hypothesis not in effects))
+                for stage, f in self.findings.items()}
+        parameters = within_prior(self.chains, _parameters(self.chains, rest).values())
+        residuals = self.chains.joined(_free_run_residuals(self.chains))
+
+        def misfit(start: Mapping[str, float]) -> float:
+            begun = {p.name: p.begin for p in started(parameters, start)}
+            return sum(float(np.sum(r * r)) for r in residuals(begun).values())
+
+        best = min((self.values, self._expected_without(effects)), key=misfit)
+        return fit(residuals, started(parameters, best), AGAIN_ROUNDS).values
+
+    def _expected_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
+        """The values without some of the effects if the readings were linear in all of them."""
+        every = _parameters(self.chains, self.findings)
+        names = list(self.fit.values)
+        z = np.array([every[n].to_standard(self.values[n]) for n in names])
+        gone = [names.index(h.own[0].name) for h in effects]
+        own = {p.name for h in effects for p in h.own}
+        kept = [j for j, n in enumerate(names) if n not in own]
+        information = self.fit.information(self.fit.ess)
+        moved = [every[names[j]].to_standard(neutral(self.chains.model, names[j])) - z[j] for j in gone]
+        z[kept] -= np.linalg.solve(information[np.ix_(kept, kept)], information[np.ix_(kept, gone)] @ moved)
+        z[gone] += moved
+        return {n: min(max(every[n].value(x), every[n].low), every[n].high) for n, x in zip(names, z, strict=True)}
 
 
 def fit_jointly(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool) -> JointFit:
@@ -90,11 +118,11 @@ def fit_jointly(chains: CutChains, findings: Mapping[str, Findings], *, gust: bo
         gust: whether `gust` was detected: the rest of the angle then says nothing of the form of an effect.
     """
     found = dict(findings)
-    values, sd = _fitted(chains, found)
+    joint, values, sd = _fitted(chains, found)
     while weak := _least_certain(chains, found, values, sd):
         stage, selection = weak
         found[stage] = found[stage].without(selection)
-        values, sd = _fitted(chains, found)
+        joint, values, sd = _fitted(chains, found)
     checks = _checks(chains, found)
 
     def widened() -> dict[str, float]:
@@ -105,20 +133,31 @@ def fit_jointly(chains: CutChains, findings: Mapping[str, Findings], *, gust: bo
         stage, selection = weak
         f = found[stage].without(selection)
         found[stage] = replace(f, final=refit(chains, stage, f.effects, f.final.values))
-        values, sd = _fitted(chains, found)
+        joint, values, sd = _fitted(chains, found)
         checks = _checks(chains, found)
-    return JointFit(found, values, widened(), checks)
+    return JointFit(chains, found, joint, values, widened(), checks)
 
 
-def _fitted(chains: CutChains, findings: Mapping[str, Findings]) -> tuple[dict[str, float], dict[str, float]]:
-    """Estimates and standard deviations of everything, fitted on the whole chain."""
-    parameters: dict[str, Parameter] = {}
+def _fitted(chains: CutChains, findings: Mapping[str, Findings]) -> tuple[Fit, dict[str, float], dict[str, float]]:
+    """The fit of everything on the whole chain, with its estimates and their standard deviations."""
     start: dict[str, float] = {}
+    for f in findings.values():
+        start.update(f.final.values)
+    joint = fit(chains.joined(_free_run_residuals(chains)), started(_parameters(chains, findings).values(), start))
+    return joint, joint.values, {name: WIDER * sd for name, sd in joint.sd.items()}
+
+
+def _parameters(chains: CutChains, findings: Mapping[str, Findings]) -> dict[str, Parameter]:
+    """All parameters by name: of the nominal model, and of the effects found."""
+    parameters: dict[str, Parameter] = {}
     for stage, f in findings.items():
         parameters.update({p.name: p for p in nominal_parameters(chains, stage)})
         parameters.update({p.name: p for h in f.effects for p in h.own})
-        start.update(f.final.values)
+    return parameters
 
+
+def _free_run_residuals(chains: CutChains) -> Callable[[CutChain, Mapping[str, float]], dict[str, Array]]:
+    """Residuals of all channels of a recording in a free run over its training part, in units of their noise."""
     def residuals(chain: CutChain, values: Mapping[str, float]) -> dict[str, Array]:
         s = chain.signals.head(chain.signals.train)
         readings = free_run_gap.free_run(chains.model, s, values)
@@ -134,8 +173,7 @@ def _fitted(chains: CutChains, findings: Mapping[str, Findings]) -> tuple[dict[s
             out["omega"] = difference(s.true_speed, readings["omega"]) / s.sigma["omega"]
         return out
 
-    joint = fit(chains.joined(residuals), started(parameters.values(), start))
-    return joint.values, {name: WIDER * sd for name, sd in joint.sd.items()}
+    return residuals
 
 
 def _checks(chains: CutChains, findings: Mapping[str, Findings]) -> dict[str, Check]:
@@ -175,7 +213,7 @@ def _least_certain(chains: CutChains, findings: Mapping[str, Findings], values: 
     model, certain = chains.model, []
     for stage, f in findings.items():
         for selection in f.found:
-            if not chains.policy.calibrated and selection[0].gain > CERTAIN:
+            if selection[0].gain > CERTAIN and not selection[0].hypothesis.parameter:
                 continue  # its existence is certain; only its size and those of other values cannot be separated
             size = selection[0].hypothesis.own[0].name
             spread = max(sd[size], NOMINAL_SD * abs(model.model[size]) if size in model.model else 0.0)

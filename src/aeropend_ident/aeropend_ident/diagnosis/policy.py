@@ -26,6 +26,13 @@ NOTICEABLE = 1.05
 Measured: ×0.7 changes 4 of 24 verdicts, ×1.3 1 (docs/results/thresholds.md)."""
 
 
+CERTAIN = 15.0
+"""Log evidence above which an effect is there, however uncertain its size is and whatever else is there.
+
+Choice: odds of 3·10⁶.
+
+Measured: at ±30 % no verdict of 14 recordings changes (docs/results/thresholds.md)."""
+
 MATERIAL = 0.3
 """RMS, in units of a reading's noise, that an effect must explain in some channel to be reported (choice).
 

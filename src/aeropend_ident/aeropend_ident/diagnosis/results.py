@@ -21,7 +21,7 @@ from aeropend_ident.diagnosis.document import (
     to_json,
 )
 from aeropend_ident.diagnosis.report import page
-from aeropend_ident.diagnosis.report.candidates import unit_of
+from aeropend_ident.diagnosis.report.candidates import share_text, unit_of
 from aeropend_ident.result_folder import atomic_folder, ensure_free
 from aeropend_sim.model.parameters import Model, save
 from aeropend_sim.untrusted import printable
@@ -115,6 +115,9 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
         lines.append(f"verdict: {' and '.join(which.effects)} ({document.where.place})")
     found = {c.effect: c for c in reversed(which.candidates)}
     lines += [f"  {effect}: {describe(found[effect])}" for effect in which.effects]
+    small = [f"{c.effect} ({share_text(c.share)})" for c in which.candidates if c.share and not c.found]
+    if small:
+        lines.append(f"  small, not claimed: {', '.join(small)} of the gap")
     lines += [f"  not separable by this recording: {' and '.join(pair)}" for pair in which.not_separable]
     if which.next_experiment:
         lines.append(f"  next: {experiment(which.next_experiment)}")
@@ -174,6 +177,7 @@ def experiment(advice: NextExperiment) -> str:
 
 
 def describe(candidate: Candidate) -> str:
-    """A candidate's parameters with units and 95 % intervals."""
-    return ", ".join(f"{name} = {p.value:.4g} ({p.low:.4g} to {p.high:.4g}) {unit_of(candidate.effect, name)}"
-                     for name, p in candidate.parameters.items())
+    """A candidate's parameters with units and 95 % intervals, and its share of the gap."""
+    texts = [f"{name} = {p.value:.4g} ({p.low:.4g} to {p.high:.4g}) {unit_of(candidate.effect, name)}"
+             for name, p in candidate.parameters.items()]
+    return ", ".join(texts) + (f"; {share_text(candidate.share)} of the gap" if candidate.share else "")

@@ -104,11 +104,15 @@ class Fit:
 
     def log_occam(self, ess: Mapping[str, float]) -> float:
         """Log Occam factor: prior density at the estimate times posterior volume; `ess` as in `log_evidence`."""
+        return self.log_prior - 0.5 * float(np.linalg.slogdet(self.information(ess))[1])
+
+    def information(self, ess: Mapping[str, float]) -> Array:
+        """Information matrix (P, P) of the parameters in standard units, prior included; `ess` as in `log_evidence`."""
         information = np.eye(len(self.values))
         for channel, (by, products) in self.products.items():
             weight = ess[channel] / len(self.residuals[channel]) / self.scale[channel] ** 2
             information[np.ix_(by, by)] += weight * products
-        return self.log_prior - 0.5 * float(np.linalg.slogdet(information)[1])
+        return information
 
 
 def estimate(values: dict[str, float], sd: dict[str, float]) -> Fit:

@@ -9,6 +9,9 @@ from scipy.fft import irfft, next_fast_len, rfft
 
 Array = NDArray[np.float64]
 
+Z95 = 1.959964
+"""Standard deviations of a normal distribution on either side of its mean that hold 95 % (derived)."""
+
 WINDOW = 5.0
 """Lag, in autocorrelation times, at which their sum stops (convention: Sokal, 1997, section 3: 4 to 10)."""
 

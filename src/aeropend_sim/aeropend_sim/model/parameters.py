@@ -78,6 +78,11 @@ PARAMETERS: dict[str, Parameter] = {
 }
 """All parameters of a model file outside `effects`, as `section.name`."""
 
+
+def parameter(name: str) -> Parameter:
+    """A parameter by its name in a diagnosis: `R_a`, or `sensing.angle_filter_tau`."""
+    return PARAMETERS[name if "." in name else f"model.{name}"]
+
 MODEL_NAMES = tuple(key[len("model."):] for key in PARAMETERS if key.startswith("model."))
 SENSING_NAMES = tuple(key[len("sensing."):] for key in PARAMETERS if key.startswith("sensing."))
 

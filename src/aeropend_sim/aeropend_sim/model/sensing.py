@@ -119,7 +119,7 @@ def true_voltage(model: Model, reading: ScalarOrArray) -> ScalarOrArray:
 
 def angle_filter_tau(model: Model) -> float:
     """[s] Time constant of each of the two stages of the angle filter, with the effect `encoder_lag`."""
-    return model.sensing["angle_filter_tau"] + model.effect("encoder_lag", "tau")
+    return max(model.sensing["angle_filter_tau"] + model.effect("encoder_lag", "tau"), 0.0)
 
 
 def prepare(model: Model, period: float = SAMPLE_PERIOD) -> MeasurementChain:

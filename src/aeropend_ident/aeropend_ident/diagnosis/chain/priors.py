@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
-from aeropend_ident.diagnosis.chain.values import STAGES
+from aeropend_ident.diagnosis.chain.values import FILTER, STAGES
 from aeropend_ident.diagnosis.policy import angle_only, free_swinging
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.signals import STILL, Signals
@@ -22,6 +22,11 @@ NOMINAL_SD = 0.03
 
 Derived: that of a uniform distribution over ±5 %, 0.05/√3."""
 
+CHAIN_SD = 0.06
+"""Relative standard deviation of the time constant of the angle's filter.
+
+Derived: that of a uniform distribution over ±10 %, 0.1/√3. Usual resistors and capacitors have such tolerances."""
+
 UNCALIBRATED_SD = 0.55
 """Standard deviation of the logarithm of an uncalibrated parameter.
 
@@ -29,8 +34,6 @@ Derived: a factor of three is two standard deviations, ln(3)/2."""
 
 ZERO = "angle_offset.bias"
 """The angle that is read while the arm hangs; for a free decay a parameter like any other."""
-
-FILTER = "sensing.angle_filter_tau"
 
 OF_THE_ARM = ("mgd_over_J", "c_over_J")
 """The parameters that an angle alone can determine."""
@@ -86,7 +89,9 @@ def model_parameters(chains: CutChains, stage: str) -> list[Parameter]:
             sd = (NOMINAL_SD if calibrated else UNCALIBRATED_SD) * abs(nominal)
             parameters.append(Parameter(name, nominal, sd, p.low, p.high))
     if calibrated:
-        return parameters
+        tau = chains.model.sensing[key(FILTER).name]
+        own = [Parameter(FILTER, tau, CHAIN_SD * tau, 0.0, 1.0)] if stage == "arm" and tau > 0.0 else []
+        return [*parameters, *own]
     if stage == "arm":
         parameters.append(_filter(chains.model))
     return _of_each(parameters, len(recordings))

@@ -20,13 +20,16 @@ STAGES: dict[str, tuple[str, ...]] = {
 }
 """The stages of the cut chain and the parameters of the model in each."""
 
+FILTER = "sensing.angle_filter_tau"
+"""The one parameter of the measurement chain that is fitted along."""
+
 CHANNELS_OF = {"actuator": ("v_a",), "motor": ("i_a", "omega"), "arm": ("theta",)}
 """The channels that each stage predicts."""
 
 PLACE_OF_PARAMETER = {
     **dict.fromkeys(STAGES["actuator"], "actuator"), **dict.fromkeys(("R_a", "L_a", "K_e"), "electrical"),
     **dict.fromkeys(("K_t", "J_m", "B_m", "k_load"), "rotor"), "k_thrust": "thrust", "L_over_J": "thrust",
-    "mgd_over_J": "arm", "c_over_J": "arm",
+    "mgd_over_J": "arm", "c_over_J": "arm", FILTER: "sensing",
 }
 """The place in the chain of each parameter of the model."""
 
@@ -57,6 +60,8 @@ def with_values(model: Model, values: Values) -> Model:
 def neutral(model: Model, name: str) -> float:
     """The value at which an effect is absent, or a parameter is nominal."""
     k = key(name)
+    if k.owner == "sensing":
+        return model.sensing[k.name]
     return CATALOGUE[k.owner].parameters[k.name].neutral if k.owner else model.model[k.name]
 
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from aeropend_ident.diagnosis.document import Candidate, DiagnosisDocument, NextExperiment
-from aeropend_ident.diagnosis.report.number_format import interval, minus, with_unit
+from aeropend_ident.diagnosis.document import Candidate, DiagnosisDocument, Interval, NextExperiment
+from aeropend_ident.diagnosis.report.number_format import interval, minus, percent, with_unit
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
 from aeropend_sim.model.parameters import PARAMETERS
+
+SAME_END = 1e-3
+"""Width of the interval of a share below which the interval is not shown (derived: its ends would be the same text)."""
 
 PROBABLE = 0.01
 """Probability from which a candidate is always visible (choice)."""
@@ -36,6 +39,7 @@ class CandidateRow:
         estimates: of its parameters.
         gap_after: [share of the spread] total gap with it; None if it was not computed.
         found: whether it is part of the verdict.
+        share: of the gap, as a text; "" if it is not in the augmented model.
     """
 
     effect: str
@@ -46,6 +50,7 @@ class CandidateRow:
     estimates: list[Estimate]
     gap_after: float | None
     found: bool
+    share: str
 
     @property
     def name(self) -> str:
@@ -82,6 +87,13 @@ def unit_of(effect: str, parameter: str) -> str:
     return CATALOGUE[effect].parameters[parameter].unit
 
 
+def share_text(share: Interval) -> str:
+    """A share of the gap with its 95 % interval: `62 % (55 % to 70 %)`."""
+    if share.high - share.low <= SAME_END:
+        return percent(share.value)
+    return f"{percent(share.value)} ({percent(share.low)} to {percent(share.high)})"
+
+
 def rows(document: DiagnosisDocument) -> list[CandidateRow]:
     """All candidates."""
     return [_row(c) for c in document.which.candidates]
@@ -94,7 +106,7 @@ def section(document: DiagnosisDocument, candidates: list[CandidateRow]) -> Cand
         document: of the diagnosis.
         candidates: all rows.
     """
-    shown = [c for c in candidates if c.found or c.probability >= PROBABLE]
+    shown = [c for c in candidates if c.found or c.share or c.probability >= PROBABLE]
     others = [c for c in candidates if c not in shown]
     return Candidates(shown, others, document.which.not_separable, document.which.next_experiment)
 
@@ -107,4 +119,5 @@ def _row(c: Candidate) -> CandidateRow:
         estimates.append(Estimate(name, with_unit(value, unit_of(c.effect, name)), between))
     physics = minus(f"{PARAMETERS[f'model.{parameter}'].description}; its value is off" if parameter
                     else CATALOGUE[c.effect].physics)
-    return CandidateRow(c.effect, parameter, c.place, physics, c.probability, estimates, c.gap_after, c.found)
+    return CandidateRow(c.effect, parameter, c.place, physics, c.probability, estimates, c.gap_after, c.found,
+                        share_text(c.share) if c.share else "")

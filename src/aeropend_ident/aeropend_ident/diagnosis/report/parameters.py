@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from aeropend_ident.diagnosis.document import DiagnosisDocument
 from aeropend_ident.diagnosis.report.number_format import exact, interval, quantity
-from aeropend_sim.model.parameters import PARAMETERS
+from aeropend_sim.model.parameters import parameter
 
 OFF = 0.05
 """Relative shift above which a parameter is marked.
@@ -95,7 +95,7 @@ def section(document: DiagnosisDocument) -> Parameters:
     for name, n in document.which.numbers.items():
         if n.determined is False:
             continue
-        p = PARAMETERS[f"model.{name}"]
+        p = parameter(name)
         value, between = interval(n.value, n.low, n.high)
         scale = abs(n.nominal) or 1.0
         shift, low, high = ((x - n.nominal) / scale for x in (n.value, n.low, n.high))
@@ -109,7 +109,7 @@ def _identified(document: DiagnosisDocument) -> IdentifiedText | None:
     identified = document.identified
     if identified is None:
         return None
-    spread = [f"{name} by {quantity(n.run_to_run, PARAMETERS[f'model.{name}'].unit.replace('-', ''), 2)}"
+    spread = [f"{name} by {quantity(n.run_to_run, parameter(name).unit.replace('-', ''), 2)}"
               for name, n in document.which.numbers.items() if n.run_to_run]
     hangs, lift = identified.hangs_at, identified.lift
     if hangs and hangs.run_to_run:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from aeropend_ident.diagnosis.document import DiagnosisDocument
-from aeropend_ident.diagnosis.report.candidates import CandidateRow
+from aeropend_ident.diagnosis.report.candidates import SAME_END, CandidateRow
 from aeropend_ident.diagnosis.report.number_format import exact, percent, quantity, with_unit
 from aeropend_sim.model.parameters import PARAMETERS
 
@@ -17,9 +17,6 @@ RANDOM = {"gust", "speed_spikes"}
 
 MOSTLY_OPEN = 0.5
 """Share of the gap below which the page explains why a random effect leaves the rest open (choice)."""
-
-SAME_END = 1e-3
-"""Width of the interval of a share below which the interval is not shown (derived: its ends would be the same text)."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +46,7 @@ class Verdict:
         lines: the effects found.
         between: the 95 % interval of the closed share, or "".
         besides: place of an unknown effect beside the effects found, or "".
+        small: effects whose share of the gap is too small to be claimed.
         unexplained: reasons for the verdict "unknown".
     """
 
@@ -58,6 +56,7 @@ class Verdict:
     lines: list[Line]
     between: str
     besides: str
+    small: list[CandidateRow]
     unexplained: tuple[str, ...]
 
 
@@ -73,7 +72,8 @@ def section(document: DiagnosisDocument, candidates: Sequence[CandidateRow]) -> 
     unknown = which.unknown
     return Verdict(_title(document), _sentence(document, found), _consequence(document, found),
                    [Line(c, _nominal(document, c)) for c in found], _between(document),
-                   unknown.place if unknown and which.verdict != "unknown" else "", which.unexplained)
+                   unknown.place if unknown and which.verdict != "unknown" else "",
+                   [c for c in candidates if c.share and not c.found], which.unexplained)
 
 
 def _title(document: DiagnosisDocument) -> str:

@@ -281,7 +281,7 @@ def angle_response(chain: CutChain, values: Mapping[str, float], drive: Array) -
     """Response (K, N) of the angle to torques over inertia (K, N), by channel."""
     model = chain.valued(values)
     n = model.numbers()
-    tau = model.sensing["angle_filter_tau"] + model.effect("encoder_lag", "tau")
+    tau = sensing.angle_filter_tau(model)
     stiffness = n["mgd_over_J"] * np.cos(chain.arm_motion(values)[0])
     return {"theta": arm_response(drive, stiffness, n["c_over_J"], tau, chain.signals.period)}
 

@@ -17,8 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.signals.smoothing import block_mean
+from aeropend_ident.signals.statistics import Z95
 from aeropend_sim.compiled import njit
 from aeropend_sim.model.dynamics import linear_arm
+from aeropend_sim.model.effects import CATALOGUE
 
 Array = NDArray[np.float64]
 
@@ -51,6 +53,7 @@ class Gust:
         gain: log likelihood over that of no torque with inflated white noise.
         torque: [rad/s²] (M,) smoothed torque.
         index: (M,) its samples.
+        resolved: whether the correlation time differs from that of a white torque and from that of a constant one.
         kurtosis: fourth moment of the filter's innovations over that of a normal distribution: 1 for a random torque;
             far above it the angle jumps, which no torque causes.
     """
@@ -64,6 +67,7 @@ class Gust:
     torque: Array
     index: NDArray[np.int64]
     kurtosis: float
+    resolved: bool
 
 
 @njit(nogil=True)
@@ -165,13 +169,16 @@ def fit_gust(residual: Array, theta: Array, gravity: float, damping: float, nois
     torque, innovations = np.zeros(n), np.zeros(n)
 
     def cost(z: Array, kept: Array = NOT_KEPT) -> float:
-        return -_filter(r, stiffness, damping, h, sd, math.exp(z[0]), math.exp(z[1]), innovations, kept)
+        tau = math.exp(min(max(z[1], shortest), longest))
+        return -_filter(r, stiffness, damping, h, sd, math.exp(z[0]), tau, innovations, kept)
 
+    limits = CATALOGUE["gust"].parameters["tau"]
+    shortest, longest = math.log(limits.low), math.log(min(limits.high, n * h))
     size = float(np.nanstd(r)) * (gravity + 1.0)
     best = min((minimize(cost, [math.log(max(size, 1e-6)), math.log(tau)], method="Nelder-Mead",
                          options={"xatol": 0.02, "fatol": 0.1, "maxfev": 60}) for tau in (0.05, 0.5)),
                key=lambda solution: solution.fun)
-    z = best.x
+    z = np.array([best.x[0], min(max(best.x[1], shortest), longest)])
     width = []
     for j in range(2):
         step = np.zeros(2)
@@ -186,8 +193,9 @@ def fit_gust(residual: Array, theta: Array, gravity: float, damping: float, nois
     _smooth(kept, stiffness, damping, h, math.exp(z[1]), torque)
     e = innovations[min(round(SETTLED / h), n // 2):]
     kurtosis = float(np.mean(e**4) / (3.0 * max(float(np.mean(e * e)), 1e-150) ** 2))
+    resolved = z[1] - Z95 * width[1] > math.log(h) and z[1] + Z95 * width[1] < longest
     return Gust(math.exp(z[0]), math.exp(z[1]), width[0], width[1], -best.fun, -best.fun - without, torque.copy(),
-                index, kurtosis)
+                index, kurtosis, bool(resolved))
 
 
 def gauss_markov(shape: tuple[int, int], tau: float, period: float, rng: np.random.Generator) -> Array:

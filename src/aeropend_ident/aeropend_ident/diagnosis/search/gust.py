@@ -110,7 +110,7 @@ def _judged(chains: CutChains, final: Fit) -> RankedHypothesis | None:
     slope = np.gradient(speed, g.index * s.period)
     columns = np.hstack([*(hats(x, knots_of(x)) for x in (theta, rate, speed, slope)), (speed * rate)[:, None]])
     known = [p for p in nominal_parameters(chains, "arm") if p.name in final.values]
-    if g.gain <= 0.0 or g.kurtosis > JUMPS or follows_state(g.torque, columns) >= RANDOM:
+    if g.gain <= 0.0 or not g.resolved or g.kurtosis > JUMPS or follows_state(g.torque, columns) >= RANDOM:
         return None
     rng = np.random.default_rng(0)
     term = missing_terms(chains, "arm", final, known,

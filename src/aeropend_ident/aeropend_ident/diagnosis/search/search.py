@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import expit
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
-from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD, nominal_parameters
+from aeropend_ident.diagnosis.chain.priors import model_parameters, nominal_parameters
 from aeropend_ident.diagnosis.chain.values import STAGES
 from aeropend_ident.diagnosis.policy import MATERIAL
 from aeropend_ident.diagnosis.search.findings import Findings, adopted, drop_unneeded
@@ -212,21 +212,28 @@ def refit(chains: CutChains, stage: str, effects: Sequence[Hypothesis], start: M
 
 def outside_prior(chains: CutChains, stage: str, f: Fit) -> bool:
     """Whether a calibrated parameter of the stage left its prior to stand in for a missing effect."""
-    nominal = chains.model.model
+    own = {p.name: p for p in model_parameters(chains, stage)}
     return chains.policy.calibrated and any(
-        abs(f.values[n] - nominal[n]) > OUTSIDE * NOMINAL_SD * abs(nominal[n]) for n in STAGES[stage] if n in f.values)
+        abs(f.values[n] - p.mean) > OUTSIDE * p.sd for n, p in own.items() if n in f.values)
 
 
-def held_within_prior(chains: CutChains, stage: str, f: Fit, known: Iterable[Parameter]) -> Fit:
+def held_within_prior(chains: CutChains, stage: str, f: Fit, known: Collection[Parameter]) -> Fit:
     """A fit of the nominal structure; if a parameter left its prior, a fit that keeps all within theirs."""
     if not outside_prior(chains, stage, f):
         return f
-    reach = {p.name: OUTSIDE * NOMINAL_SD * abs(p.mean) for p in known if p.name in STAGES[stage]}
-    held = [replace(p, low=max(p.low, p.mean - reach[p.name]), high=min(p.high, p.mean + reach[p.name]))
-            if p.name in reach else p for p in known]
+    held = within_prior(chains, known)
     carried = {n: v for n, v in f.values.items() if n not in {p.name for p in held}}
     residuals = chains.residuals(stage)
     return fit(lambda values: residuals({**carried, **values}), held)
+
+
+def within_prior(chains: CutChains, parameters: Collection[Parameter]) -> list[Parameter]:
+    """The parameters, with calibrated ones bounded to `OUTSIDE` standard deviations of their priors."""
+    if not chains.policy.calibrated:
+        return list(parameters)
+    own = {p.name for stage in STAGES for p in model_parameters(chains, stage)}
+    return [replace(p, low=max(p.low, p.mean - OUTSIDE * p.sd), high=min(p.high, p.mean + OUTSIDE * p.sd))
+            if p.name in own else p for p in parameters]
 
 
 def _explained(here: SelectionRound) -> bool:

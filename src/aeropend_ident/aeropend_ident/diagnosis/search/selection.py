@@ -49,6 +49,12 @@ CLOSE = 1.5
 
 Measured: at ±30 % no verdict of 22 recordings changes (docs/results/thresholds.md)."""
 
+CLOSE_GAIN = 10.0
+"""Log evidence by which a rival may be behind and still be close (choice: what another form of an effect may cost).
+
+Measured: on simulated rigs whose effects have another form the true one is up to 6 behind. Far more decides, though
+free curves may say otherwise: with many small imperfections they explain those."""
+
 FORM_SHOWS = 1.2
 """Mean square residual, in units of a reading's noise, above which an effect's form does not fit (choice).
 
@@ -214,7 +220,8 @@ class SelectionRound:
         elsewhere. The likelihoods with free curves divide the total probability of the close rivals.
         """
         best = mean_square(ranked[0].fit, self.stage)
-        close = [r for r in ranked[:CONTENDERS] if r.gain > 0.0 and mean_square(r.fit, self.stage) < CLOSE * best]
+        close = [r for r in ranked[:CONTENDERS] if r.gain > max(ranked[0].gain - CLOSE_GAIN, 0.0)
+                 and mean_square(r.fit, self.stage) < CLOSE * best]
         if best < FORM_SHOWS or len({r.hypothesis.place for r in close}) < 2:
             return ranked
         left: list[tuple[float, float]] = []

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import nominal_parameters
-from aeropend_ident.diagnosis.policy import GOOD_ENOUGH
+from aeropend_ident.diagnosis.policy import CERTAIN, GOOD_ENOUGH
 from aeropend_ident.diagnosis.search import speed_spikes
 from aeropend_ident.diagnosis.search.findings import Findings
 from aeropend_ident.diagnosis.search.free_curves import MissingTerm, missing_terms
@@ -25,6 +25,16 @@ Array = NDArray[np.float64]
 BY_CHANCE = 3.0
 """Standard deviations of a mean square that pass as chance (convention: 99.7 %)."""
 
+ONE_TERM = 4.0
+"""Ratio of what effects leave to what one missing term leaves above which they only approximate that term.
+
+Choice: the term leaves half as much (RMS). With many small imperfections effects and one term leave about the same."""
+
+MOSTLY_LEFT = 0.5
+"""Share of the misfit that effects of a stage leave above which they only approximate an unknown one.
+
+Derived: they explain less than they leave."""
+
 VISIBLE = 0.005
 """RMS of a channel's misfit, relative to the channel's spread, above which it matters (choice)."""
 
@@ -35,11 +45,12 @@ class UnknownEffect:
 
     Attributes:
         term: the missing term at its likeliest place.
-        first: whether it is larger than all effects found.
+        instead: the stages whose effects may only approximate it: one term explains far more, they leave most, or none
+            of them is certain.
     """
 
     term: MissingTerm
-    first: bool
+    instead: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -81,19 +92,14 @@ Misfits = Mapping[str, Mapping[str, Misfit]]
 """Stage -> channel -> misfit."""
 
 
-def judge(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool, spikes: bool
-          ) -> tuple[UnknownEffect | None, dict[str, Findings]]:
-    """Look for an unknown effect.
+def judge(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool, spikes: bool) -> UnknownEffect | None:
+    """The unknown effect, if there is one.
 
     Args:
         chains: cut.
         findings: stage -> what was found.
         gust: whether `gust` was detected: the rest of the angle is then no misfit of the model.
         spikes: whether `speed_spikes` was detected: false captures that were not recognised are then no misfit.
-
-    Returns:
-        The unknown effect, if there is one, and the findings. Findings in its stage are taken back: they only
-        approximated it.
     """
     def misfits(fits: Mapping[str, Fit]) -> Misfits:
         return {b: {c: _misfit(chains, c, r) for c, r in f.residuals.items()
@@ -114,6 +120,7 @@ def judge(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool, sp
         return amount[b] / total if total > 0.0 else 0.0
 
     terms: dict[str, MissingTerm] = {}
+    instead: set[str] = set()
     for b, f in findings.items():
         if not any(m.amount > 0.0 for m in base[b].values()):
             continue
@@ -121,21 +128,22 @@ def judge(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool, sp
         elsewhere = bool(f.found) and term.place not in {h.place for h in f.effects}
         # several effects of one place may be one effect of another form; a parameter has no form
         several = len({h.place for h in f.effects}) > 1 or any(h.parameter for h in f.effects)
-        simpler = several and term.left < f.final.mean_square
+        simpler = f.final.mean_square - 1.0 > ONE_TERM * max(term.left - 1.0, 0.0)
         kept = share(b, base)
         if (share(b, held) > limits.form or (kept > limits.form_elsewhere and elsewhere)
-                or (kept > limits.form_of_several and simpler)
+                or (kept > limits.form_of_several and several and simpler)
                 or any(m.remains(held[b][c], limits.kept) for c, m in left[b].items())):
             terms[b] = term
+            certain = any(selection[0].gain > CERTAIN for selection in f.found)
+            if (simpler and (several or elsewhere)) or not certain:
+                instead.add(b)
     if not terms:
-        return None, dict(findings)
+        return None
     worst = max(terms, key=lambda b: amount[b])
+    if share(worst, base) > MOSTLY_LEFT:
+        instead.add(worst)
     term = _placed(chains, worst, findings[worst].base, known[worst]) if worst == "motor" else terms[worst]
-    explained = max((sum(m.amount for m in base[b].values()) - amount[b] for b in findings
-                     if b not in terms and findings[b].found), default=0.0)
-    explained = max(explained, captures)
-    unknown = UnknownEffect(term, sum(m.amount for m in base[worst].values()) > explained)
-    return unknown, {b: f.nothing() if b in terms else f for b, f in findings.items()}
+    return UnknownEffect(term, frozenset(instead))
 
 
 def _placed(chains: CutChains, stage: str, base: Fit, known: list[Parameter]) -> MissingTerm:

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The verdict goes by the parts of the gap."""
+
+import numpy as np
+import pytest
+
+from aeropend_ident.diagnosis import gap_share
+from aeropend_ident.diagnosis.free_run_gap import Gap
+from aeropend_ident.diagnosis.gap_share import UNKNOWN, Part, headline, shares, unexplained
+
+
+def part(name, amount, place="arm", unsure=0.0, windows=10):
+    return Part(name, place, amount, np.full(windows, float(amount)), unsure)
+
+
+def test_shares_are_parts_of_the_whole_gap_the_unexplained_rest_included():
+    found = shares([part("coulomb_friction", 3.0), part("brush_drop", 1.0), part("", 1.0)])
+    assert {name: s.value for name, s in found.items()} == {"coulomb_friction": 0.6, "brush_drop": 0.2}
+    assert all(s.low == pytest.approx(s.value) == pytest.approx(s.high) for s in found.values())
+
+
+def test_an_uncertain_size_and_a_gap_that_varies_widen_the_interval():
+    steady, unsure = part("a", 1.0), part("a", 1.0, unsure=0.2)
+    varying = Part("a", "arm", 1.0, np.tile([0.0, 2.0], 5))
+    widths = [(s := shares([one, part("b", 1.0)])["a"]).high - s.low for one in (steady, unsure, varying)]
+    assert widths[0] < 1e-9 < widths[1]
+    assert 0.1 < widths[2] < 1.0
+
+
+def test_false_captures_do_not_count_in_the_shares_of_others():
+    found = shares([part(gap_share.CAPTURES, 1000.0), part("gust", 1.0), part("", 1.0)])
+    assert found["gust"].value == 0.5
+    assert found[gap_share.CAPTURES].value == 1.0
+
+
+@pytest.mark.parametrize(("parts", "verdict", "effects", "small"), [
+    ([], "none", [], []),
+    ([part("", 1.0)], "none", [], []),
+    ([part("gust", 2.0), part("brush_drop", 3.0)], "brush_drop", ["brush_drop", "gust"], []),
+    ([part("gust", 2.0), part("brush_drop", 0.01)], "gust", ["gust"], ["brush_drop"]),
+    ([part("gust", 2.0), part("brush_drop", -1.0)], "gust", ["gust"], ["brush_drop"]),
+    ([part("gust", 2.0), part(UNKNOWN, 1.0, "thrust")], "gust", ["gust"], []),
+    ([part("gust", 1.0), part(UNKNOWN, 2.0, "thrust")], "unknown", ["gust"], []),
+    ([part("gust", 0.6), part("brush_drop", 0.6), part(UNKNOWN, 1.3, "thrust")], "unknown", ["gust", "brush_drop"], []),
+    ([part(UNKNOWN, 0.0, "thrust")], "unknown", [], []),
+])
+def test_the_verdict_is_the_largest_part(parts, verdict, effects, small):
+    head = headline(parts, shares(parts), 0.03)
+    assert (head.verdict, head.effects, head.small) == (verdict, effects, small)
+    if verdict == "unknown":
+        assert head.place == "thrust"
+
+
+def test_mismatches_of_two_parameters_are_one_effect():
+    parts = [part("parameter_mismatch:R_a", 2.0, "electrical"), part("parameter_mismatch:J_m", 1.0, "rotor")]
+    head = headline(parts, shares(parts), 0.03)
+    assert (head.verdict, head.place, head.effects) == ("parameter_mismatch", "electrical", ["parameter_mismatch"])
+
+
+def test_what_is_left_above_the_floor_lies_where_its_channel_shows_it_or_at_the_unknown_effect():
+    after = Gap({"theta": 0.2, "i_a": 0.1}, {"theta": 1.0, "i_a": 1.0}, np.full((4, 2), [0.04, 0.01]))
+    floors = {"theta": 0.1, "i_a": 0.1}
+    (arm,) = unexplained(after, floors, None, None)
+    assert (arm.name, arm.place, arm.amount) == ("", "arm", pytest.approx(0.015))
+    np.testing.assert_allclose(arm.windows, 0.015)
+    (unknown,) = unexplained(after, floors, None, "thrust")
+    assert (unknown.name, unknown.place, unknown.amount) == (UNKNOWN, "thrust", pytest.approx(0.015))

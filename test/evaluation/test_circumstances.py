@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The blind check of rigs as they are draws what it says, and each of its figures can fail."""
+
+import numpy as np
+import pytest
+from evaluation.blind import cases, circumstances, plant
+from evaluation.blind.circumstances import Judged
+from evaluation.blind.score import Answer
+
+from aeropend_sim.model.parameters import load
+
+BENCH = load("bench")
+
+
+def test_a_messy_rig_has_many_imperfections_and_one_main_effect():
+    rng = np.random.default_rng(3)
+    drawn, shares = circumstances.messy(rng, BENCH.model, BENCH.sensing, cases.duty_signal(rng, 20.0))
+    assert 11 <= len(drawn) <= 13
+    assert len({d.effect for d in drawn}) == len(drawn)
+    main = drawn[0].effect
+    assert main in plant.EFFECTS
+    assert shares[main] == max(shares.values()) > circumstances.MAIN_SHARE[0]
+
+
+def test_three_effects_are_at_three_places():
+    for row, effects in circumstances.plan(40, 1):
+        if row == "three effects":
+            assert len({cases.PLACES[e] for e in effects}) == 3
+
+
+@pytest.mark.parametrize("row", circumstances.ROWS)
+def test_a_recording_is_made_of_each_circumstance(row):
+    effects = {"closed loop": ["gust"], "three effects": ["gust", "supply_sag", "thrust_lag"]}.get(row, [])
+    label, columns, lost = circumstances.make(row, effects, BENCH.model, BENCH.sensing, 5, 10.0)
+    assert label["row"] == row
+    assert all(np.isfinite(x).all() for x in columns.values())
+    assert not lost[0]
+    assert bool(label["effects"]) == (row != "nothing missing")
+
+
+def judged(row, effects, shares, first, found, stated=None, place="arm"):
+    label = {"row": row, "shares": shares,
+             "effects": [{"effect": e, "place": "arm", "parameters": {}} for e in effects]}
+    return Judged(label, Answer(first, tuple(found), place=place, seconds=1.0), stated or {})
+
+
+def values(*all_):
+    return {f.name: f.value for f in circumstances.figures(all_)}
+
+
+def test_each_figure_of_the_circumstances_can_fail():
+    shares = {"gust": 0.8, "brush_drop": 0.01}
+    right = judged("messy", ["gust", "brush_drop"], shares, "gust", ["gust"], {"gust": (0.8, 0.7, 0.9)})
+    wrong = judged("messy", ["gust", "brush_drop"], shares, "brush_drop", ["brush_drop", "gust", "thrust_lag"],
+                   {"gust": (0.5, 0.4, 0.6)}, "electrical")
+    good, bad = values(right), values(wrong)
+    for name, best, worst in (("messy, half of the gap or more: main effect first", 1.0, 0.0),
+                              ("messy, half of the gap or more: place", 1.0, 0.0),
+                              ("messy: ghosts a recording", 0.0, 2.0),
+                              ("messy: 95 % interval of the share holds the true share", 1.0, 0.0)):
+        assert (good[name], bad[name]) == (best, worst), name
+    nothing = "nothing missing: an effect or `unknown` claimed"
+    assert values(judged("nothing missing", [], {}, "none", []))[nothing] == 0.0
+    assert values(judged("nothing missing", [], {}, "unknown", []))[nothing] == 1.0
+    three = "three effects: all named"
+    assert values(judged("three effects", ["gust", "supply_sag"], {}, "gust", ["gust", "supply_sag"]))[three] == 1.0
+    assert values(judged("three effects", ["gust", "supply_sag"], {}, "gust", ["gust"]))[three] == 0.0
+    loop = "closed loop: right effect first"
+    assert values(judged("closed loop", ["gust"], {}, "gust", ["gust"]))[loop] == 1.0
+    assert values(judged("closed loop", ["gust"], {}, "none", []))[loop] == 0.0
