@@ -9,6 +9,7 @@ import pytest
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.gap_share import MATERIAL_SHARE
 from aeropend_ident.diagnosis.results import document, verdict_lines
+from aeropend_ident.diagnosis.validation import validate
 from aeropend_ident.signals.signals import from_arrays
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, recorded, steps
 from aeropend_sim.model import rig
@@ -187,6 +188,18 @@ def test_several_recordings_of_one_rig_are_fitted_together():
     assert both["which"]["effects"] == ["coulomb_friction"]
     width = [candidate(b, "coulomb_friction")["parameters"]["accel"] for b in (both, one)]
     assert width[0]["high"] - width[0]["low"] < width[1]["high"] - width[1]["low"]
+
+
+@pytest.mark.parametrize("missing", [1000, 5000])
+def test_a_test_recording_whose_angle_comes_late_is_judged_from_there_on(missing):
+    model = drawn_rig(97, {"coulomb_friction": {}})
+    found = diagnose(BENCH, [recorded(97, {"coulomb_friction": {}})], 2)
+    duty = steps(40.0, 99)
+    columns, _ = rig.record(model, duty, 99)
+    columns["theta"] = columns["theta"].copy()
+    columns["theta"][:missing] = np.nan
+    signals = from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)
+    assert validate(found.model, found.augmented, signals).closed > 0.8
 
 
 def test_the_verdict_does_not_depend_on_the_number_of_threads():

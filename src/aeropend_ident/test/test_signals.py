@@ -88,6 +88,16 @@ def test_what_cannot_be_compared_is_said(replaced, word):
     assert "\n" not in str(raised.value)
 
 
+@pytest.mark.parametrize("how", ["missing", "at a stop"])
+def test_an_angle_that_is_not_read_on_held_out_data_is_said(how):
+    data = columns(20.0)
+    theta = data["theta"].copy()
+    theta[round(0.69 * len(theta)):] = np.nan if how == "missing" else 1.0
+    with pytest.raises(RecordingError, match="not read in the part that is held out") as raised:
+        from_arrays({**data, "theta": theta}, SAMPLE_PERIOD, BENCH.sensing, name="my_bag")
+    assert "\n" not in str(raised.value)
+
+
 def test_too_short_is_said():
     short = {name: x[:1000] for name, x in columns().items()}
     with pytest.raises(RecordingError, match=r"2\.0 s of samples"):

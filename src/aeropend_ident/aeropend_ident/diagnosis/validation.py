@@ -31,7 +31,8 @@ def validate(model: Model, augmented: Model, signals: Signals) -> ClosedGap:
         augmented: with what other recordings of the rig showed.
         signals: the recording.
     """
-    start = min(round(FORGOTTEN / signals.period), len(signals) // 2)
+    first = int(np.argmax(np.isfinite(signals.theta)))
+    start = min(first + round(FORGOTTEN / signals.period), len(signals) // 2)
     left_out = signals.false_speed if "speed_spikes" in augmented.effects else None
     runs = [free_run_gap.free_run(m, signals, _initial_state(m, signals.head(start))) for m in (model, augmented)]
     before, after = (free_run_gap.gap(run, signals, start, len(signals), leave)

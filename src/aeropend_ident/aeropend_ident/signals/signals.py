@@ -152,6 +152,10 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
             columns[channel] = np.full(n, np.nan)
             said.append(f"{channel} is {x[0]:g} {CHANNELS[channel]} all the time, whatever the duty: it is left out")
     said += _leave_out(columns, period, train)
+    for part, where in ((slice(train), "fitted"), (slice(train, n), f"held out, the last {n - train} samples")):
+        if n > train and not np.isfinite(columns["theta"][part]).any():
+            raise RecordingError(f"{name}: the arm angle was not read in the part that is {where}: it is missing or at "
+                                 "the end of its range; record again, or cut that part off")
     if np.ptp(columns["theta"][np.isfinite(columns["theta"])]) == 0.0:
         raise RecordingError(f"{name}: the arm angle stays the same all the time: the sensor or the arm is stuck, "
                              "so no verdict is possible")

@@ -168,6 +168,8 @@ def state_of_arm(model: Model, s: Signals, recording: int = 0) -> list[Parameter
         recording: its number.
     """
     known = np.flatnonzero(np.isfinite(s.theta))
+    if not len(known) or known[0] * s.period > FIRST_READINGS:  # an arm that was not read yet is taken to hang
+        return [Parameter(_initial(name, recording), 0.0, sd) for name, sd in (("theta", 0.3), ("theta_dot", 5.0))]
     first = known[:max(6, int(np.searchsorted(known, known[0] + FIRST_READINGS / s.period)))]
     t = first * s.period
     _, rate, angle = np.polyfit(t, s.theta[first], 2) if len(first) > 3 else (0.0, 0.0, float(s.theta[first[0]]))
