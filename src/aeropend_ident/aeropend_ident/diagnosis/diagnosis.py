@@ -20,7 +20,7 @@ from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model
 from aeropend_ident.diagnosis.chain.pwm_timing import with_pwm_timing
-from aeropend_ident.diagnosis.chain.values import PLACE_OF_PARAMETER, neutral, of_rig, with_values
+from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, PLACE_OF_PARAMETER, neutral, of_rig, with_values
 from aeropend_ident.diagnosis.conclude import Statistical
 from aeropend_ident.diagnosis.document import Channel, Closure, Conclusions, Curve, Residual, Where, Which
 from aeropend_ident.diagnosis.document import UnknownEffect as DrawnEffect
@@ -160,7 +160,7 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     found = _find(fitted, settings.jobs, progress)
     progress("fitting all jointly", 0.75)
     found, joint, gaps = _fit_and_measure(fitted, found, progress)
-    if found.unknown is not None and gaps.after.within(gaps.floors):
+    if found.unknown is not None and gaps.after.within(gaps.floors, CHANNELS_OF[found.unknown.stage]):
         found = replace(found, unknown=None)
     parts = _parts(found, joint, gaps, settings.jobs)
     if found.unknown is not None and _approximated(found.unknown, joint, gaps, parts):

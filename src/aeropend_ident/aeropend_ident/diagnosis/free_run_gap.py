@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,9 +105,9 @@ class Gap:
         return float(np.sqrt(np.mean([(floors[c] / self.spread[c]) ** 2 for c in self.rms])))
 
 
-    def within(self, floors: Mapping[str, float]) -> bool:
-        """Whether no channel has a gap above its floor that could be closed."""
-        return all(self.rms[c] <= (1.0 + NOTHING_OPEN) * floors[c] for c in self.rms)
+    def within(self, floors: Mapping[str, float], channels: Collection[str]) -> bool:
+        """Whether none of some channels has a gap above its floor that could be closed."""
+        return all(self.rms[c] <= (1.0 + NOTHING_OPEN) * floors[c] for c in self.rms if c in channels)
 
 
 def gap(readings: Mapping[str, Array], signals: Signals, start: int, stop: int,

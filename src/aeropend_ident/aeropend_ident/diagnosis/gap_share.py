@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 UNKNOWN = "unknown"
 """Name of the part that an effect outside of the catalogue makes."""
 
+LEAST_DRAWN = 1e-3
+"""Gap of a resample, relative to the whole, below which its shares mean nothing (choice)."""
+
 CAPTURES = "speed_spikes"
 """Name of the part that false captures make."""
 
@@ -161,7 +164,7 @@ def shares(parts: Sequence[Part], seed: int = 0) -> dict[str, Interval]:
     picks = rng.integers(0, blocks, (RESAMPLES, blocks)) if blocks > 1 else np.zeros((RESAMPLES, 1), dtype=np.intp)
     drawn = np.array([p.windows[picks].mean(axis=1) * (1.0 + p.unsure * rng.standard_normal(RESAMPLES)) ** 2
                       for p in parts])
-    drawn /= np.maximum(np.maximum(drawn, 0.0).sum(axis=0), 1e-300)
+    drawn = np.clip(drawn / np.maximum(np.maximum(drawn, 0.0).sum(axis=0), total * LEAST_DRAWN), -1.0, 1.0)
     ends = np.percentile(drawn, [2.5, 97.5], axis=1)
     found = captures
     for p, low, high in zip(parts, *ends, strict=True):

@@ -164,11 +164,11 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
         near = steps[:, None] + np.arange(math.ceil(SETTLED / period) + 1)
         columns["i_a"] = columns["i_a"].copy()
         columns["i_a"][np.minimum(near, n - 1)] = np.nan
+    sigma = _noise(columns, duty, sensing, train)
     if len(unsure):
         said.append(f"{counted(len(unsure), 'step')} of the duty fell between samples, into lost ones, at an instant "
                     "that nothing shows: current and speed are not compared just after")
         columns["i_a"] = np.where(shaken, np.nan, columns["i_a"])
-    sigma = _noise(columns, duty, sensing, train)
     if np.ptp(duty) < STILL and np.nanstd(columns["theta"]) < 2.0 * sigma["theta"]:
         raise RecordingError(f"{name}: nothing happens in it, duty and angle stay where they are, so no verdict is "
                              "possible; record while `excite` runs")
