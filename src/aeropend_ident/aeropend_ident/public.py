@@ -19,7 +19,8 @@ from aeropend_sim.model.parameters import Model, load
 
 
 def diagnose(recordings: Recording | Sequence[Recording], model: Model | str = "bench", *, fit_nominal: bool = False,
-             held_out: float = 0.3, jobs: int = 1, material: float = MATERIAL_SHARE) -> Diagnosis:
+             held_out: float = 0.3, jobs: int = 1, material: float = MATERIAL_SHARE,
+             seconds: float | None = None) -> Diagnosis:
     """Find where a model and a rig differ, which effect causes it, and how far the gap closes.
 
     Args:
@@ -29,6 +30,7 @@ def diagnose(recordings: Recording | Sequence[Recording], model: Model | str = "
         held_out: share at the end of each recording that nothing is fitted to.
         jobs: threads; the result does not depend on them.
         material: share of the gap from which an effect is claimed.
+        seconds: [s] that the search may take; None: a budget of simulations bounds it where it may be long.
 
     Raises:
         RecordingError: no verdict is possible; one line that says why.
@@ -37,7 +39,8 @@ def diagnose(recordings: Recording | Sequence[Recording], model: Model | str = "
     model = load(model) if isinstance(model, str) else model
     several = [recordings] if isinstance(recordings, Recording) else list(recordings)
     signals = [as_signals(r, model.sensing, held_out, fit_nominal=fit_nominal) for r in several]
-    return diagnosis.diagnose(model, signals, jobs, fit_nominal=fit_nominal, material=material)
+    return diagnosis.diagnose(model, signals, jobs, fit_nominal=fit_nominal, material=material,
+                              seconds=seconds)
 
 
 def identify(data: Recording | Dataset, method: str = "weak", *, model: Model | str = "bench",

@@ -202,6 +202,16 @@ def test_a_test_recording_whose_angle_comes_late_is_judged_from_there_on(missing
     assert validate(found.model, found.augmented, signals).closed > 0.8
 
 
+@pytest.mark.promise("Verdict", "A person says how long the search may take, and is told if it was too short")
+def test_a_search_ends_at_its_time_and_says_so():
+    signals = recorded(71, {"coulomb_friction": {}, "brush_drop": {}}, duration=20.0)
+    none, long = (diagnose(BENCH, [signals], 2, seconds=s) for s in (0.0, 600.0))
+    assert none.conclusions.which.effects == ()
+    assert any("--seconds" in note for s in none.signals for note in s.notes)
+    assert set(long.conclusions.which.effects) == {"coulomb_friction", "brush_drop"}
+    assert not any("--seconds" in note for s in long.signals for note in s.notes)
+
+
 def test_the_verdict_does_not_depend_on_the_number_of_threads():
     signals = recorded(3, {"quadratic_drag": {}}, duration=20.0)
     assert diagnose(BENCH, [signals], 1).body == diagnose(BENCH, [signals], 2).body

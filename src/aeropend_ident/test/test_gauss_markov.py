@@ -2,7 +2,8 @@
 import numpy as np
 import pytest
 
-from aeropend_ident.diagnosis.search.gauss_markov import fit_gust, follows_state
+from aeropend_ident.diagnosis.search.free_curves import arm_response
+from aeropend_ident.diagnosis.search.gauss_markov import fit_gust, follows_state, gauss_markov
 from aeropend_ident.testing.rigs import drawn_rig, steps
 from aeropend_sim.model import rig
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
@@ -26,3 +27,12 @@ def test_a_torque_that_follows_the_state_is_told_from_chance():
     x = np.random.default_rng(0).standard_normal(5000)
     assert follows_state(2.0 * x + 1.0, x[:, None]) == pytest.approx(1.0, abs=1e-3)
     assert follows_state(np.random.default_rng(1).standard_normal(5000), x[:, None]) < 0.01
+
+
+@pytest.mark.parametrize(("tau", "resolved"), [(0.3, True), (1e-3, False), (300.0, False)])
+def test_a_torque_that_is_white_or_constant_has_no_correlation_time(tau, resolved):
+    gravity, damping, h = 20.0, 1.0, SAMPLE_PERIOD
+    torque = gauss_markov((1, 20000), tau, h, np.random.default_rng(5))[0] * (2.0 if resolved else 20.0)
+    angle = arm_response(torque[None, :], np.full(20000, gravity), damping, 0.0, h)[0]
+    read = angle + 2e-3 * np.random.default_rng(6).standard_normal(len(angle))
+    assert fit_gust(read, np.zeros(len(read)), gravity, damping, 2e-3, h).resolved == resolved

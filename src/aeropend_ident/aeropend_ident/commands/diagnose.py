@@ -78,6 +78,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--material", type=between(0.0, 1.0, "a share"), default=MATERIAL_SHARE, metavar="SHARE",
                         help="share of the gap from which an effect is claimed; smaller ones are listed as small "
                              f"(default: {MATERIAL_SHARE:g})")
+    parser.add_argument("--seconds", type=between(0.0, 1e6, "a time", " s"), metavar="S",
+                        help="how long the search for effects may take (default: a number of simulations bounds it for "
+                             "uncalibrated rigs); a note tells if more time could change the verdict")
     parser.add_argument("--overwrite", action="store_true", help="replace results in the folder")
     options = parser.parse_args(arguments)
     if options.dask is not None and not options.each:
@@ -114,7 +117,7 @@ def run(options: argparse.Namespace, command: str) -> None:
                                       fit_nominal=options.fit_nominal) for bag in bags]
                           for bags in (options.bags, options.test))
         found = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal, material=options.material,
-                         progress=lambda what, share: show(share, what))
+                         seconds=options.seconds, progress=lambda what, share: show(share, what))
         shown = [Across(bag, **vars(validate(found.model, found.augmented, s))) for bag, s in zip(options.test, tests)]
         made = document(found, options.bags, options.model, time.monotonic() - started, shown)
         results = Results.of(found, made, command)
@@ -136,7 +139,7 @@ def run_each(options: argparse.Namespace) -> None:
     for name in names:
         ensure_free(out / name, FILES, overwrite=options.overwrite)
     settings = batch.Settings(load(options.model), options.model, options.namespace, options.held_out,
-                             options.fit_nominal, options.material)
+                             options.fit_nominal, options.material, options.seconds)
     commands = [_alone(options, bag, out / name) for bag, name in zip(options.bags, names)]
     rows = []
     try:
@@ -169,6 +172,7 @@ def _alone(options: argparse.Namespace, bag: str, out: Path) -> str:
     words = ["diagnose", bag, "--out", str(out), "--model", options.model, "--held-out", f"{options.held_out:g}"]
     words += ["--namespace", options.namespace] if options.namespace is not None else []
     words += ["--material", f"{options.material:g}"] if options.material != MATERIAL_SHARE else []
+    words += ["--seconds", f"{options.seconds:g}"] if options.seconds is not None else []
     return shlex.join(words + ["--fit-nominal"] * options.fit_nominal)
 
 

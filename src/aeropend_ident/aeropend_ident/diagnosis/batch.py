@@ -46,6 +46,7 @@ class Settings:
         held_out: share of each recording that nothing is fitted to.
         fit_nominal: whether the rigs are uncalibrated.
         material: share of the gap from which an effect is claimed.
+        seconds: [s] that each search may take; None: a budget of simulations bounds it where it may be long.
     """
 
     model: Model
@@ -54,6 +55,7 @@ class Settings:
     held_out: float = 0.3
     fit_nominal: bool = False
     material: float = MATERIAL_SHARE
+    seconds: float | None = None
 
 
 @dataclass(frozen=True)
@@ -147,7 +149,7 @@ def _examine(task: _Task) -> Outcome:
     threadpool_limits(1)
     try:
         found = diagnose(task.settings.model, [task.signals], 1, fit_nominal=task.settings.fit_nominal,
-                         material=task.settings.material)
+                         material=task.settings.material, seconds=task.settings.seconds)
         made = document(found, [task.bag], task.settings.name, task.reading + time.monotonic() - started)
         return Outcome(task.bag, Results.of(found, made, task.command))
     except Exception as error:

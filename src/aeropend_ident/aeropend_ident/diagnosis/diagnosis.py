@@ -7,6 +7,7 @@ judge whether an effect is unknown -> fit all jointly -> measure the gap -> conc
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -42,7 +43,7 @@ from aeropend_sim.model.parameters import Model
 Array = NDArray[np.float64]
 
 CUT_SHORT = ("the search was cut short to bound its time: an effect beside the first, or a rival close to it, may have "
-             "been missed")
+             "been missed; --seconds says how long it may take")
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ Progress = Callable[[str, float], None]
 
 
 def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progress: Progress = lambda *_: None, *,
-             fit_nominal: bool = False, material: float = MATERIAL_SHARE) -> Diagnosis:
+             fit_nominal: bool = False, material: float = MATERIAL_SHARE, seconds: float | None = None) -> Diagnosis:
     """Find where a model and a rig differ, which effect causes it, and how far the gap closes.
 
     Args:
@@ -88,6 +89,7 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
         progress: called as the work goes on.
         fit_nominal: whether the rig is uncalibrated: its parameters are known to a factor of three at best.
         material: share of the gap from which an effect is claimed.
+        seconds: [s] that the search may take; None: a budget of simulations bounds it where it may be long.
     """
     with threadpool_limits(1):  # the matrices are narrow: threads of the linear algebra would slow each other down
         if fit_nominal:
@@ -95,7 +97,7 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
             model, recordings = fit_nominal_model(model, recordings)
         policy = policy_of(recordings, fit_nominal=fit_nominal)
         kind = CutChains if policy.calibrated else CachedChains
-        return _diagnose(with_pwm_timing(kind(model, recordings, policy)), Settings(jobs, material), progress)
+        return _diagnose(with_pwm_timing(kind(model, recordings, policy)), Settings(jobs, material, seconds), progress)
 
 
 @dataclass(frozen=True)
@@ -105,10 +107,12 @@ class Settings:
     Attributes:
         jobs: threads.
         material: share of the gap from which an effect is claimed.
+        seconds: [s] that the search may take; None: a budget of simulations bounds it where it may be long.
     """
 
     jobs: int = 1
     material: float = MATERIAL_SHARE
+    seconds: float | None = None
 
 
 @dataclass(frozen=True)
@@ -157,7 +161,7 @@ class _Gaps:
 
 def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diagnosis:
     """The steps after the chain is cut; `fitted`: the chains whose training part parameters are fitted to."""
-    found = _find(fitted, settings.jobs, progress)
+    found = _find(fitted, settings, progress)
     progress("fitting all jointly", 0.75)
     found, joint, gaps = _fit_and_measure(fitted, found, progress)
     if found.unknown is not None and gaps.after.within(gaps.floors, CHANNELS_OF[found.unknown.stage]):
@@ -196,12 +200,14 @@ def _approximated(unknown: UnknownEffect, joint: JointFit, gaps: _Gaps, parts: S
     return theirs.amount + rest > max(others, default=0.0)
 
 
-def _find(fitted: CutChains, jobs: int, progress: Progress) -> _Findings:
+def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Findings:
     """Search effects, detect those that only statistics show, and judge whether one is unknown."""
     chains, recordings = fitted, fitted.recordings
     if not fitted.policy.driven:  # a decay has few swings: effects are selected on all of them
         chains = CutChains(fitted.model, [replace(s, train=len(s)) for s in recordings], fitted.policy)
-    stages = search(chains, jobs, lambda stage, share: progress(f"searching effects of the {stage}", 0.7 * share))
+    deadline = None if settings.seconds is None else time.monotonic() + settings.seconds
+    stages = search(chains, settings.jobs,
+                    lambda stage, share: progress(f"searching effects of the {stage}", 0.7 * share), deadline)
     if any(f.cut_short for f in stages.values()):
         recordings = [s.noted(CUT_SHORT) for s in recordings]
     progress("testing for random effects", 0.7)

@@ -52,14 +52,15 @@ EVEN = 0.5
 Derived: an effect is then more likely than none."""
 
 
-def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], None] = lambda *_: None
-           ) -> dict[str, Findings]:
+def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], None] = lambda *_: None,
+           deadline: float | None = None) -> dict[str, Findings]:
     """Search for effects stage by stage, along the chain.
 
     Args:
         chains: cut; the input of each stage is set to what was measured, described by what was found before it.
         jobs: threads.
         progress: called with the stage and the share of stages behind it.
+        deadline: [s] of `time.monotonic` after which no further effect is searched; None: the budget of the policy.
 
     Returns:
         Stage -> what was found.
@@ -72,7 +73,7 @@ def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], No
         for done, stage in enumerate(STAGES):
             progress(stage, done / len(STAGES))
             mine = [h for h in everything if acts_on[h.name][:1] == (stage,)]
-            f = _search_stage(chains, stage, mine, acts_on, list(carried.values()), pool)
+            f = _search_stage(chains, stage, mine, acts_on, list(carried.values()), pool, deadline)
             findings[stage] = f
             # an effect that acts on later stages too goes along, with the uncertainty that it has here
             for h in f.effects:
@@ -85,8 +86,8 @@ def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], No
 
 
 def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
-                  acts_on: Mapping[str, tuple[str, ...]], carried: list[Parameter], pool: ThreadPoolExecutor
-                  ) -> Findings:
+                  acts_on: Mapping[str, tuple[str, ...]], carried: list[Parameter], pool: ThreadPoolExecutor,
+                  deadline: float | None) -> Findings:
     nominal: list[Parameter] = [*nominal_parameters(chains, stage), *carried]
     base = fit(chains.residuals(stage), nominal)
     findings = Findings(stage, base, base)
@@ -97,7 +98,7 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
     downstream = {b: fit(chains.residuals(b), nominal_parameters(chains, b)) for b in others}
     known = nominal
     while len(findings.found) < MOST_EFFECTS:
-        here = SelectionRound(chains, stage, acts_on, downstream, known, findings.final, pool)
+        here = SelectionRound(chains, stage, acts_on, downstream, known, findings.final, pool, deadline)
         if chains.policy.driven and _explained(here):
             break
         if here.budget_spent:

@@ -10,6 +10,7 @@ The order, as `search` calls it: `screened` (linear algebra leaves a shortlist, 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -86,6 +87,7 @@ class SelectionRound:
         known: the parameters so far.
         current: their fit.
         pool: threads.
+        deadline: [s] of `time.monotonic` after which no further effect is searched; None: the budget decides.
     """
 
     chains: CutChains
@@ -95,10 +97,13 @@ class SelectionRound:
     known: list[Parameter]
     current: Fit
     pool: ThreadPoolExecutor
+    deadline: float | None = None
 
     @property
     def budget_spent(self) -> bool:
-        """Whether the search has cost as many simulations as it may."""
+        """Whether the search has cost as much time, or as many simulations, as it may."""
+        if self.deadline is not None:
+            return time.monotonic() > self.deadline
         budget = self.chains.policy.budget
         return budget is not None and self.chains.runs > budget
 
