@@ -2,6 +2,7 @@
 """Known truth in, the same truth out: every effect at its default size, in rigs whose numbers are off."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from aeropend_sim.model import rig
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+from aeropend_sim.untrusted import printable
 
 RANDOM = {"gust", "speed_spikes"}
 
@@ -84,6 +86,15 @@ def test_an_effect_that_makes_little_of_the_gap_is_small_unless_a_person_asks_fo
     assert (usual.effects, usual.small) == (("brush_drop",), ("coulomb_friction",))
     assert (strict.effects, strict.small) == (("brush_drop", "coulomb_friction"), ())
     assert [c.effect for c in usual.candidates if c.found] == ["brush_drop"]
+
+
+def test_the_verdict_in_a_terminal_tells_the_shares_in_plain_characters():
+    signals = recorded(71, {"coulomb_friction": {"accel": 0.2}, "brush_drop": {"v_brush": 0.8}})
+    lines = verdict_lines(document(diagnose(BENCH, [signals], 2), ["bag"], "bench", 0.0))
+    (claimed,) = (line for line in lines if line.startswith("  brush_drop: "))
+    (small,) = (line for line in lines if line.startswith("  small, not claimed: coulomb_friction, "))
+    assert all(re.search(r"\d+ % \(-?\d+ to \d+ %\) of the gap$", line) for line in (claimed, small))
+    assert lines == [printable(line) for line in lines]
 
 
 @pytest.mark.promise("Verdict", "The numbers of the measurement chain have tolerances")

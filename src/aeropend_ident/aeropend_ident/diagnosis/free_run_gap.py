@@ -104,7 +104,6 @@ class Gap:
         """The same of floors by channel: the total gap of a perfect model."""
         return float(np.sqrt(np.mean([(floors[c] / self.spread[c]) ** 2 for c in self.rms])))
 
-
     def within(self, floors: Mapping[str, float], channels: Collection[str]) -> bool:
         """Whether none of some channels has a gap above its floor that could be closed."""
         return all(self.rms[c] <= (1.0 + NOTHING_OPEN) * floors[c] for c in self.rms if c in channels)

@@ -16,12 +16,13 @@ from aeropend_ident.diagnosis.document import (
     ClosedGap,
     DiagnosisDocument,
     Identified,
+    Interval,
     NextExperiment,
     ParameterRow,
     to_json,
 )
 from aeropend_ident.diagnosis.report import page
-from aeropend_ident.diagnosis.report.candidates import share_text, unit_of
+from aeropend_ident.diagnosis.report.candidates import unit_of
 from aeropend_ident.result_folder import atomic_folder, ensure_free
 from aeropend_sim.model.parameters import Model, save
 from aeropend_sim.untrusted import printable
@@ -115,9 +116,9 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
         lines.append(f"verdict: {' and '.join(which.effects)} ({document.where.place})")
     found = {c.effect: c for c in reversed(which.candidates)}
     lines += [f"  {effect}: {describe(found[effect])}" for effect in which.effects]
-    small = [f"{c.effect} ({share_text(c.share)})" for c in which.candidates if c.share and not c.found]
+    small = [f"{c.effect}, {of_the_gap(c.share)}" for c in which.candidates if c.share and not c.found]
     if small:
-        lines.append(f"  small, not claimed: {', '.join(small)} of the gap")
+        lines.append(f"  small, not claimed: {'; '.join(small)}")
     lines += [f"  not separable by this recording: {' and '.join(pair)}" for pair in which.not_separable]
     if which.next_experiment:
         lines.append(f"  next: {experiment(which.next_experiment)}")
@@ -162,8 +163,17 @@ def gap_line(name: str, closed: ClosedGap) -> str:
         return f"{line}: nothing to close"
     interval = ""
     if closed.low is not None and closed.high is not None:
-        interval = f" ({_percent(closed.low)} to {_percent(closed.high)} %)"
+        interval = _between(closed.low, closed.high)
     return f"{line}: {_percent(closed.closed)} %{interval} of the gap above the floor is closed"
+
+
+def of_the_gap(share: Interval) -> str:
+    """A share of the gap with its 95 % interval: `62 % (55 to 70 %) of the gap`."""
+    return f"{_percent(share.value)} %{_between(share.low, share.high)} of the gap"
+
+
+def _between(low: float, high: float) -> str:
+    return f" ({_percent(low)} to {_percent(high)} %)"
 
 
 def _percent(share: float) -> int:
@@ -180,4 +190,4 @@ def describe(candidate: Candidate) -> str:
     """A candidate's parameters with units and 95 % intervals, and its share of the gap."""
     texts = [f"{name} = {p.value:.4g} ({p.low:.4g} to {p.high:.4g}) {unit_of(candidate.effect, name)}"
              for name, p in candidate.parameters.items()]
-    return ", ".join(texts) + (f"; {share_text(candidate.share)} of the gap" if candidate.share else "")
+    return ", ".join(texts) + (f"; {of_the_gap(candidate.share)}" if candidate.share else "")
