@@ -11,7 +11,6 @@ All is fitted to the free run by `scipy.optimize.least_squares`, from several st
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 
@@ -64,7 +63,7 @@ def _run(x: Array, duty: Array, period: float) -> Array:
     dead, power, up, delay = x[3], x[4], math.exp(x[5]), x[7] / period
     down, friction, zero = up * math.exp(x[6]), x[8] * gravity, x[9]
     theta, speed = x[10], x[11]
-    steps = max(int(math.ceil(period / STEP - 1e-9)), 1)
+    steps = max(math.ceil(period / STEP - 1e-9), 1)
     h = period / steps
     out = np.empty(len(duty))
     lift = max(duty[0] - dead, 0.0) ** power if abs(theta) > 0.1 else 0.0
@@ -89,7 +88,7 @@ def _run(x: Array, duty: Array, period: float) -> Array:
     return out
 
 
-def fit(time: Array, theta: Array, duty: Array, train: int, progress: Callable[[str], None] = lambda _: None) -> GreyBox:
+def fit(time: Array, theta: Array, duty: Array, train: int) -> GreyBox:
     """Fit the grey box to the beginning of a recording.
 
     Args:
@@ -97,7 +96,6 @@ def fit(time: Array, theta: Array, duty: Array, train: int, progress: Callable[[
         theta: [rad] (N,) angle; NaN where it is missing.
         duty: (N,) applied command, 0 to 1.
         train: samples that are fitted.
-        progress: called with a line as the work goes on.
     """
     dense = bool(np.isfinite(theta).mean() > 0.5)
     every = max(int(STEP / float(time[1] - time[0])), 1) if dense else 1
@@ -124,7 +122,6 @@ def fit(time: Array, theta: Array, duty: Array, train: int, progress: Callable[[
         starts.append(np.array([math.log(gravity), math.log(0.1 * math.sqrt(gravity)), math.log(gain), 0.0, power,
                                 math.log(lag), 0.0, 0.01, friction, 0.0, first, 0.0]))
     screened = sorted((search(x, SCREENED) for x in starts), key=lambda found: found[0])
-    progress(f"{len(starts)} starts, the best leaves {screened[0][0]:.4g}")
     _, best = min((search(x, EVALUATIONS) for _, x in screened[:FOLLOWED]), key=lambda found: found[0])
     run = _run(best, u, period)
     return GreyBox(dict(zip(NAMES, map(float, best), strict=True)), np.interp(time, t, run))

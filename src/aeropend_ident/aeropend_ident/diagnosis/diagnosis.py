@@ -8,8 +8,9 @@ judge whether an effect is unknown -> fit all jointly -> measure the gap -> conc
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,23 +18,35 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from aeropend_ident.diagnosis import conclude, gap_share, regions, typed_json
+from aeropend_ident.diagnosis.chain import static_map
 from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model
 from aeropend_ident.diagnosis.chain.pwm_timing import with_pwm_timing
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, PLACE_OF_PARAMETER, neutral, of_rig, with_values
 from aeropend_ident.diagnosis.conclude import Statistical
-from aeropend_ident.diagnosis.document import Channel, Closure, Conclusions, Curve, Residual, Where, Which
+from aeropend_ident.diagnosis.document import (
+    CANNOT_TELL,
+    Channel,
+    Closure,
+    Conclusions,
+    Curve,
+    GapBudget,
+    Residual,
+    Where,
+    Which,
+)
 from aeropend_ident.diagnosis.document import UnknownEffect as DrawnEffect
 from aeropend_ident.diagnosis.experiment_design import EXPERIMENTS, experiments_within
 from aeropend_ident.diagnosis.free_run_gap import Gap, HeldOut, closure
+from aeropend_ident.diagnosis.gap_budget import Repeats, budget
 from aeropend_ident.diagnosis.gap_share import MATERIAL_SHARE, Part
 from aeropend_ident.diagnosis.joint_fit import JointFit, fit_jointly
 from aeropend_ident.diagnosis.policy import GOOD_ENOUGH, policy_of
 from aeropend_ident.diagnosis.search import gust, speed_spikes, unknown_effect
 from aeropend_ident.diagnosis.search.findings import Findings
-from aeropend_ident.diagnosis.search.free_curves import MissingTerm
-from aeropend_ident.diagnosis.search.search import refit, search
+from aeropend_ident.diagnosis.search.free_curves import MissingTerm, Repeatable
+from aeropend_ident.diagnosis.search.search import refit, search, unsearched
 from aeropend_ident.diagnosis.search.unknown_effect import UnknownEffect
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import CHANNELS, Signals
@@ -126,6 +139,7 @@ class _Findings:
         unknown: an effect that the catalogue does not hold.
         misfit: of the nominal structure where it fits worst.
         recordings: with the notes of the search.
+        failed: why the nominal model could not be identified; "" if it was.
     """
 
     chains: CutChains
@@ -134,6 +148,7 @@ class _Findings:
     unknown: UnknownEffect | None
     misfit: regions.Misfit
     recordings: Sequence[Signals]
+    failed: str = ""
 
 
 @dataclass(frozen=True)
@@ -148,6 +163,7 @@ class _Gaps:
         before: gap of the nominal model.
         after: gap of the augmented model.
         floors: channel -> floor.
+        repeats: how much of the rest of each stage repeats.
     """
 
     held_out: HeldOut
@@ -157,6 +173,22 @@ class _Gaps:
     before: Gap
     after: Gap
     floors: Mapping[str, float]
+    repeats: Repeats
+
+    @cached_property
+    def fitted(self) -> Gap:
+        """The gap of the augmented model on the fitted parts."""
+        return self.held_out.fitted().gap(self.runs_after)
+
+    def fits(self, channel: str) -> tuple[float, float]:
+        """Fit of the augmented model's free run, on the fitted parts and on the held-out ones."""
+        there, here = self.fitted, self.after
+        return 1.0 - there.rms[channel] / there.spread[channel], 1.0 - here.rms[channel] / here.spread[channel]
+
+    def budget(self, *, gust: bool) -> GapBudget | None:
+        """What could be closed of the gap, measured where the arm moves."""
+        moving = self.held_out.in_motion()
+        return budget(moving.gap(self.runs_before), moving.gap(self.runs_after), self.floors, self.repeats, gust=gust)
 
 
 def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diagnosis:
@@ -167,6 +199,12 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     if found.unknown is not None and gaps.after.within(gaps.floors, CHANNELS_OF[found.unknown.stage]):
         found = replace(found, unknown=None)
     parts = _parts(found, joint, gaps, settings.jobs)
+    if harmful := {p.name for p in parts if p.amount < 0.0}:
+        found, joint, gaps = _fit_and_measure(fitted, _without(found, harmful), progress)
+        parts = _parts(found, joint, gaps, settings.jobs)
+    if found.unknown is not None and not _repeats(parts, settings.material):
+        found = replace(found, unknown=None)
+        parts = _parts(found, joint, gaps, settings.jobs)
     if found.unknown is not None and _approximated(found.unknown, joint, gaps, parts):
         stages = {b: f.nothing() if b in found.unknown.instead else f for b, f in found.stages.items()}
         found, joint, gaps = _fit_and_measure(fitted, replace(found, stages=stages), progress)
@@ -188,6 +226,23 @@ def _fit_and_measure(fitted: CutChains, found: _Findings, progress: Progress) ->
     return found, joint, _measure(fitted, found, joint)
 
 
+def _without(found: _Findings, names: Collection[str]) -> _Findings:
+    """The findings without some effects: those that make the gap larger on data that no fit has used."""
+    stages = dict(found.stages)
+    for stage, f in found.stages.items():
+        kept = tuple(s for s in f.found if s[0].hypothesis.name not in names)
+        if len(kept) < len(f.found):
+            final = refit(found.chains, stage, [s[0].hypothesis for s in kept], f.final.values)
+            stages[stage] = replace(f, found=kept, final=final)
+    return replace(found, stages=stages)
+
+
+def _repeats(parts: Sequence[Part], material: float) -> bool:
+    """Whether a material share of the gap repeats that no effect explains: only then an effect may be missing."""
+    share = gap_share.shares(parts)
+    return gap_share.UNKNOWN in share and share[gap_share.UNKNOWN].value >= material
+
+
 def _approximated(unknown: UnknownEffect, joint: JointFit, gaps: _Gaps, parts: Sequence[Part]) -> bool:
     """Whether effects found only approximate an unknown one whose part of the gap, theirs included, is the largest."""
     effects = [h for b in unknown.instead for h in joint.findings[b].effects]
@@ -203,6 +258,11 @@ def _approximated(unknown: UnknownEffect, joint: JointFit, gaps: _Gaps, parts: S
 def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Findings:
     """Search effects, detect those that only statistics show, and judge whether one is unknown."""
     chains, recordings = fitted, fitted.recordings
+    if fitted.policy.wide_search:
+        stages = unsearched(fitted)
+        if failed := static_map.why_not_identified(recordings, stages["arm"].base.residuals):
+            return _Findings(fitted, stages, Statistical(None, None), None, regions.largest_misfit(fitted, stages),
+                             recordings, failed)
     if not fitted.policy.driven:  # a decay has few swings: effects are selected on all of them
         chains = CutChains(fitted.model, [replace(s, train=len(s)) for s in recordings], fitted.policy)
     deadline = None if settings.seconds is None else time.monotonic() + settings.seconds
@@ -232,7 +292,7 @@ def _measure(fitted: CutChains, found: _Findings, joint: JointFit) -> _Gaps:
     held_out = HeldOut(chains, model, found.recordings, spikes=found.statistical.spikes is not None)
     before, after = held_out.runs(base), held_out.runs(values)
     return _Gaps(held_out, base, before, after, held_out.gap(before, known=False), held_out.gap(after),
-                 held_out.floors())
+                 held_out.floors(), Repeats(chains, values))
 
 
 def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Part], settings: Settings
@@ -242,16 +302,19 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
     calibrated = chains.policy.calibrated
     share = gap_share.shares(parts)
     head = gap_share.headline(parts, share, settings.material)
+    if found.failed:
+        head = replace(head, verdict=CANNOT_TELL, place="none")
     candidates = conclude.candidates(joint, found.statistical, gaps.held_out, gaps.after.total, head.claimed, share)
     reasons = [f"{c} is off by {x:.1f} times a reading's noise"
                for c, x in _left(stages, gust=found.statistical.gust is not None).items() if x > GOOD_ENOUGH]
+    reasons = [found.failed] if found.failed else reasons
     undecided = conclude.not_separable(stages, chains.policy.undecided)
     tried = EXPERIMENTS if calibrated else experiments_within(max(float(s.duty.max()) for s in found.recordings))
     rows = conclude.parameter_rows(chains, joint)
     closed, low, high = closure(gaps.before, gaps.after, gaps.floors)
     places = gap_share.share_of_places(parts, lambda: _parts_of_parameters(joint, gaps))
     return Conclusions(
-        channels={c: Channel(CHANNELS[c], gaps.before.rms[c], gaps.floors[c], gaps.after.rms[c])
+        channels={c: Channel(CHANNELS[c], gaps.before.rms[c], gaps.floors[c], gaps.after.rms[c], *gaps.fits(c))
                   for c in CHANNELS if c in gaps.before.rms},
         where=Where(head.place, regions.shares(places), tuple(regions.regions(found.misfit))),
         which=Which(head.verdict, tuple(head.effects), candidates, rows,
@@ -261,7 +324,8 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
                     tuple(conclude.names(a, b) for a, b in undecided),
                     conclude.next_experiment(chains.model, found.recordings[0], undecided, joint.values, tried),
                     tuple(head.small)),
-        closure=Closure(gaps.before.total, gaps.after.total, gaps.before.total_floor(gaps.floors), closed, low, high),
+        closure=Closure(gaps.before.total, gaps.after.total, gaps.before.total_floor(gaps.floors), closed, low, high,
+                        budget=gaps.budget(gust=found.statistical.gust is not None)),
         identified=None if calibrated else conclude.identified_model(chains, joint, rows))
 
 
@@ -274,8 +338,12 @@ def _parts(found: _Findings, joint: JointFit, gaps: _Gaps, jobs: int) -> list[Pa
     """The parts of the gap: of each effect, and of what stays unexplained."""
     held_out, statistical = gaps.held_out.in_motion(), found.statistical
     parts = gap_share.parts_of_effects(joint, held_out, jobs)
-    parts += gap_share.unexplained(held_out.gap(gaps.runs_after), gaps.floors, statistical.gust,
-                                   None if found.unknown is None else found.unknown.term.place)
+    unknown = None
+    if found.unknown is not None:
+        # of a calibrated rig the noise is known: what exceeds it is missing in the model, though it may not repeat
+        share = 1.0 if found.chains.policy.calibrated else gaps.repeats.of_stage(found.unknown.stage).share
+        unknown = Repeatable(found.unknown.term.place, share)
+    parts += gap_share.unexplained(held_out.gap(gaps.runs_after), gaps.floors, statistical.gust, unknown)
     if statistical.spikes is not None:  # they are few: the held-out part may hold none
         whole = gaps.held_out.everywhere()
         parts.append(gap_share.part_of_spikes(statistical.spikes, whole.gap(gaps.runs_before, known=False),

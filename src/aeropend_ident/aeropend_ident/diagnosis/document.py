@@ -18,6 +18,9 @@ from aeropend_ident.diagnosis import typed_json
 from aeropend_ident.diagnosis.typed_json import JsonError
 from aeropend_sim.errors import UserError
 
+CANNOT_TELL = "cannot_tell"
+"""Verdict if the nominal model could not be identified."""
+
 FORMAT = 1
 """Number of the format that this version writes and reads (format)."""
 
@@ -35,12 +38,16 @@ class Channel:
         gap: of the nominal model.
         floor: what the measurement chain alone leaves: noise, resolution, pulse timing.
         gap_after: of the augmented model.
+        fit_fitted: 1 - RMS/spread of the augmented model's free run on the part that was fitted.
+        fit_unseen: the same on held-out data.
     """
 
     unit: str
     gap: float
     floor: float
     gap_after: float
+    fit_fitted: float
+    fit_unseen: float
 
 
 @dataclass(frozen=True)
@@ -218,13 +225,13 @@ class Which:
     """Which effect causes the gap.
 
     Attributes:
-        verdict: id of the effect with the largest share, "parameter_mismatch", "none" or "unknown".
+        verdict: id of the effect with the largest share, "parameter_mismatch", "none", "unknown" or "cannot_tell".
         effects: ids of all effects claimed, the largest share first.
         small: ids of effects in the augmented model whose share of the gap is too small to be claimed.
         candidates: the ranked hypotheses, the most probable first.
         numbers: name -> refitted parameter of the model.
         residuals: channel -> tests of its residuals.
-        unexplained: reasons for the verdict "unknown", as sentences.
+        unexplained: reasons for the verdict "unknown" or "cannot_tell", as sentences.
         unknown: an effect that the catalogue does not hold; null if there is none.
         not_separable: pairs of hypotheses that the recordings cannot separate.
         next_experiment: what to record next; null if nothing is open.
@@ -286,6 +293,23 @@ class Across(ClosedGap, _OfBag):
 
 
 @dataclass(frozen=True)
+class GapBudget:
+    """What could be closed of the squared gap above the floor; the three shares sum to 1.
+
+    Attributes:
+        found: share that the effects found and the refitted parameters close.
+        repeatable: share that a function of duty and state would close beyond that, by cross-validation over time.
+        not_repeatable: share that no such function predicts: random, or different each time.
+        place: whose function closes most of the repeatable share; null if there is none.
+    """
+
+    found: float
+    repeatable: float
+    not_repeatable: float
+    place: str | None
+
+
+@dataclass(frozen=True)
 class Closure(ClosedGap):
     """How far the gap closes on held-out data. A total gap is the RMS over the channels, each in units of its spread.
 
@@ -297,9 +321,11 @@ class Closure(ClosedGap):
         low: lower end of its 95 % interval; null if there is too little data.
         high: upper end of its 95 % interval; null if there is too little data.
         across: the same on further recordings, if there are any.
+        budget: what could be closed at all; null if there is nothing to close.
     """
 
     across: tuple[Across, ...] = ()
+    budget: GapBudget | None = None
 
 
 @dataclass(frozen=True)

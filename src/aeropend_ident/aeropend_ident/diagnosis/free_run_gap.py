@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,10 @@ FEWEST = 10
 
 NOTHING_OPEN = 0.1
 """Gap above the floor, in floors, below which nothing is left to close (choice)."""
+
+
+Part = Literal["held out", "fitted", "whole"]
+"""Part of the recordings on which a gap is measured."""
 
 
 def free_run(model: Model, signals: Signals, values: Mapping[str, float] | None = None) -> dict[str, Array]:
@@ -200,13 +205,13 @@ class HeldOut:
         model: the nominal model.
         recordings: of one rig.
         spikes: whether `speed_spikes` was detected: false captures then do not count.
-        whole: whether to measure on the whole recordings instead.
+        part: of each recording on which is measured.
     """
 
     def __init__(self, chains: CutChains, model: Model, recordings: Sequence[Signals], *, spikes: bool,
-                 whole: bool = False) -> None:
+                 part: Part = "held out") -> None:
         self.chains, self.model, self.recordings, self.spikes = chains, model, recordings, spikes
-        self.whole = whole
+        self.part = part
 
     def in_motion(self) -> HeldOut:
         """The same, on the whole recordings if an arm rests in its held-out part, where no effect would show."""
@@ -215,7 +220,11 @@ class HeldOut:
 
     def everywhere(self) -> HeldOut:
         """The same on the whole recordings."""
-        return HeldOut(self.chains, self.model, self.recordings, spikes=self.spikes, whole=True)
+        return HeldOut(self.chains, self.model, self.recordings, spikes=self.spikes, part="whole")
+
+    def fitted(self) -> HeldOut:
+        """The same on the fitted parts."""
+        return HeldOut(self.chains, self.model, self.recordings, spikes=self.spikes, part="fitted")
 
     def runs(self, values: Mapping[str, float]) -> list[dict[str, Array]]:
         """Free runs of the model with these values, one a recording."""
@@ -228,7 +237,8 @@ class HeldOut:
             readings: of a model, one a recording.
             known: whether false captures, if detected, are left out.
         """
-        gaps = [gap(r, s, 0 if self.whole else s.train, len(s), s.false_speed if known and self.spikes else None)
+        gaps = [gap(r, s, s.train if self.part == "held out" else 0, s.train if self.part == "fitted" else len(s),
+                    s.false_speed if known and self.spikes else None)
                 for r, s in zip(readings, self.recordings, strict=True)]
         if len(gaps) == 1:
             return gaps[0]

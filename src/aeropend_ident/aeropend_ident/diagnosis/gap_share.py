@@ -15,6 +15,7 @@ from aeropend_ident.diagnosis.document import Interval
 from aeropend_ident.diagnosis.free_run_gap import RESAMPLES, Gap, HeldOut
 from aeropend_ident.diagnosis.joint_fit import JointFit
 from aeropend_ident.diagnosis.search.findings import RankedHypothesis
+from aeropend_ident.diagnosis.search.free_curves import Repeatable
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
 
 Array = NDArray[np.float64]
@@ -110,7 +111,7 @@ def part_of_several(effects: Sequence[Hypothesis], joint: JointFit, held_out: He
     return Part(UNKNOWN, place, without.total**2 - after.total**2, _windows(without) - _windows(after))
 
 
-def unexplained(after: Gap, floors: Mapping[str, float], random: RankedHypothesis | None, unknown: str | None
+def unexplained(after: Gap, floors: Mapping[str, float], random: RankedHypothesis | None, unknown: Repeatable | None
                 ) -> list[Part]:
     """What the augmented model leaves above the floor, by the place whose misfit each channel shows first.
 
@@ -118,7 +119,7 @@ def unexplained(after: Gap, floors: Mapping[str, float], random: RankedHypothesi
         after: gap of the augmented model.
         floors: channel -> floor.
         random: `gust`, if it was detected: what the angle keeps is its part.
-        unknown: place of an unknown effect, if there is one: everything else that is left is its part.
+        unknown: place of an unknown effect, if there is one, and the share of the rest that repeats: that is its part.
     """
     parts: list[Part] = []
     for j, (channel, rms) in enumerate(after.rms.items()):
@@ -128,14 +129,16 @@ def unexplained(after: Gap, floors: Mapping[str, float], random: RankedHypothesi
         if random is not None and channel == "theta":
             parts.append(Part(random.hypothesis.name, random.hypothesis.place, max(amount, 0.0), windows))
         elif amount > 0.0:
-            name = "" if unknown is None else UNKNOWN
-            parts.append(Part(name, unknown or PLACE_OF_CHANNEL[channel], amount, windows))
+            share = 0.0 if unknown is None else unknown.share
+            if unknown is not None:
+                parts.append(Part(UNKNOWN, unknown.place, share * amount, share * windows))
+            parts.append(Part("", PLACE_OF_CHANNEL[channel], (1.0 - share) * amount, (1.0 - share) * windows))
     together = [p for p in parts if p.name == UNKNOWN]
     if unknown is None:
         return parts
     none = np.zeros(len(after.windows))
     return [*(p for p in parts if p.name != UNKNOWN),
-            Part(UNKNOWN, unknown, sum(p.amount for p in together), sum((p.windows for p in together), none))]
+            Part(UNKNOWN, unknown.place, sum(p.amount for p in together), sum((p.windows for p in together), none))]
 
 
 def part_of_spikes(spikes: RankedHypothesis, with_: Gap, without: Gap) -> Part:
@@ -183,7 +186,7 @@ def headline(parts: Sequence[Part], share: Mapping[str, Interval], material: flo
         material: share from which an effect is claimed.
     """
     named = sorted((p for p in parts if p.name), key=lambda p: -p.amount)
-    claimed = [p for p in named if p.name == UNKNOWN or (p.name in share and share[p.name].value >= material)]
+    claimed = [p for p in named if p.name in share and share[p.name].value >= material]
     effects = _ids(p for p in claimed if p.name != UNKNOWN)
     small = [e for e in _ids(p for p in named if p not in claimed) if e not in effects]
     names = {p.name for p in claimed}

@@ -10,17 +10,20 @@ from pathlib import Path
 
 from aeropend_ident.diagnosis.diagnosis import Diagnosis
 from aeropend_ident.diagnosis.document import (
+    CANNOT_TELL,
     FORMAT,
     Across,
     Candidate,
     ClosedGap,
     DiagnosisDocument,
+    GapBudget,
     Identified,
     Interval,
     NextExperiment,
     ParameterRow,
     to_json,
 )
+from aeropend_ident.diagnosis.gap_share import MATERIAL_SHARE
 from aeropend_ident.diagnosis.report import page
 from aeropend_ident.diagnosis.report.candidates import unit_of
 from aeropend_ident.result_folder import atomic_folder, ensure_free
@@ -109,6 +112,8 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
     lines = []
     if which.verdict == "none":
         lines.append("verdict: none. With refitted parameters the model explains the recording.")
+    elif which.verdict == CANNOT_TELL:
+        lines.append(f"verdict: cannot tell. {'; '.join(which.unexplained).capitalize()}.")
     elif which.verdict == "unknown":
         why = f": {'; '.join(which.unexplained)}" if which.unexplained else ""
         lines.append(f"verdict: unknown ({document.where.place}). No effect of the catalogue explains the misfit{why}.")
@@ -125,6 +130,11 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
     if document.identified is not None:
         lines.append(f"  {identified_line(document.identified, which.numbers)}")
     lines.append(gap_line("gap on held-out data", closure))
+    fits = [f"{c} {_percent(one.fit_fitted)} % on the fitted part, {_percent(one.fit_unseen)} % on the unseen one"
+            for c, one in document.channels.items()]
+    lines.append(f"  fit of the free run: {'; '.join(fits)}")
+    if closure.budget is not None:
+        lines.append(budget_line(closure.budget))
     lines += [gap_line(f"gap on {across.bag}, not fitted to", across) for across in closure.across]
     return lines
 
@@ -165,6 +175,13 @@ def gap_line(name: str, closed: ClosedGap) -> str:
     if closed.low is not None and closed.high is not None:
         interval = _between(closed.low, closed.high)
     return f"{line}: {_percent(closed.closed)} %{interval} of the gap above the floor is closed"
+
+
+def budget_line(budget: GapBudget) -> str:
+    """What could be closed of the gap at all."""
+    at = f" in the {budget.place}" if budget.place and budget.repeatable >= MATERIAL_SHARE else ""
+    return (f"  of the squared gap: {_percent(budget.found)} % closed, {_percent(budget.repeatable)} % would be closed "
+            f"by some function of duty and state{at}, {_percent(budget.not_repeatable)} % does not repeat")
 
 
 def of_the_gap(share: Interval) -> str:

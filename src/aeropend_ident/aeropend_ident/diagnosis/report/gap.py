@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from aeropend_ident.diagnosis.document import Closure, DiagnosisDocument
-from aeropend_ident.diagnosis.report.number_format import quantity
+from aeropend_ident.diagnosis.document import Closure, DiagnosisDocument, GapBudget
+from aeropend_ident.diagnosis.report.number_format import percent, quantity
 from aeropend_ident.diagnosis.report.variables import VARIABLES, Variable
 from aeropend_ident.signals.signals import CHANNELS
 
@@ -33,11 +33,29 @@ class ChannelRow:
 
 
 @dataclass(frozen=True)
+class BudgetPart:
+    """A part of the bar that shows what could be closed; `start` and `width` [% of the bar], `label` in words."""
+
+    start: float
+    width: float
+    colour: str
+    label: str
+
+
+@dataclass(frozen=True)
 class GapTable:
-    """The content of the section; `missing`: names of channels that were not measured."""
+    """The content of the section.
+
+    Attributes:
+        rows: one a channel.
+        total: over all channels.
+        budget: what could be closed, part by part; empty if nothing is open.
+        missing: names of channels that were not measured.
+    """
 
     rows: list[ChannelRow]
     total: Closure
+    budget: list[BudgetPart]
     missing: list[str]
 
 
@@ -56,4 +74,17 @@ def section(document: DiagnosisDocument) -> GapTable:
                  f"floor {quantity(c.floor, v.unit)}")
         bars = (100.0 * c.gap / top, 100.0 * c.gap_after / top, 100.0 * c.floor / top)
         rows.append(ChannelRow(v, c.gap, c.gap_after, c.floor, bars, label))
-    return GapTable(rows, document.closure, missing(document))
+    return GapTable(rows, document.closure, _budget(document.closure.budget), missing(document))
+
+
+def _budget(budget: GapBudget | None) -> list[BudgetPart]:
+    if budget is None:
+        return []
+    at = f" in the {budget.place}" if budget.place else ""
+    parts, start = [], 0.0
+    for share, colour, words in ((budget.found, "augmented", "closed"),
+                                 (budget.repeatable, "nominal", f"a function of duty and state{at} would close it"),
+                                 (budget.not_repeatable, "measured", "does not repeat")):
+        parts.append(BudgetPart(start, 100.0 * share, colour, f"{percent(share)} {words}"))
+        start += 100.0 * share
+    return parts

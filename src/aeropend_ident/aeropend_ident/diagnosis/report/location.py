@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aeropend_ident.diagnosis.document import DiagnosisDocument, Region
+from aeropend_ident.diagnosis.document import CANNOT_TELL, DiagnosisDocument, Region
 from aeropend_ident.diagnosis.regions import Misfit
 from aeropend_ident.diagnosis.report.binned import AGAINST, Binned, Cell, binned, cell, varies
 from aeropend_ident.diagnosis.report.candidates import CandidateRow
@@ -87,7 +87,7 @@ def section(document: DiagnosisDocument, misfit: Misfit, candidates: Sequence[Ca
     where = document.where
     places = [Place(name, where.share.get(name, 0.0), OUTPUT_OF[name], name == where.place,
                     [c.name for c in candidates if c.found and c.place == name]) for name in PLACES]
-    found = document.which.verdict != "none"
+    found = document.which.verdict not in ("none", CANNOT_TELL)
     return Location(found, places, [_text(r) for r in where.regions],
                     _cells(misfit, where.regions) if found or where.regions else [])
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from aeropend_ident.diagnosis.document import DiagnosisDocument
+from aeropend_ident.diagnosis.document import CANNOT_TELL, DiagnosisDocument
 from aeropend_ident.diagnosis.report.candidates import SAME_END, CandidateRow
 from aeropend_ident.diagnosis.report.number_format import exact, percent, quantity, with_unit
 from aeropend_sim.model.parameters import PARAMETERS
@@ -78,7 +78,8 @@ def section(document: DiagnosisDocument, candidates: Sequence[CandidateRow]) -> 
 
 def _title(document: DiagnosisDocument) -> str:
     which = document.which
-    found = {"none": "nothing missing", "unknown": "unknown effect"}.get(which.verdict, ", ".join(which.effects))
+    found = {"none": "nothing missing", "unknown": "unknown effect", CANNOT_TELL: "cannot tell"}.get(
+        which.verdict, ", ".join(which.effects))
     return f"{found} · diagnose"
 
 
@@ -97,6 +98,8 @@ def _sentence(document: DiagnosisDocument, found: Sequence[CandidateRow]) -> lis
     are = "is off." if len(parameters) == 1 else "are off."
     if verdict == "none":
         return [Part("The model lacks nothing that this recording shows.")]
+    if verdict == CANNOT_TELL:
+        return [Part("Cannot tell: the nominal model could not be identified from this recording.")]
     if verdict == "unknown":
         return [Part(f"The model lacks an effect that the catalogue does not contain, at this place: {place}.")]
     if not effects:
@@ -116,7 +119,7 @@ def _consequence(document: DiagnosisDocument, found: Sequence[CandidateRow]) -> 
     if share is None:
         return "There is nothing to close: the gap is within the noise of the readings."
     it = "it" if len(found) == 1 else "them"
-    if which.verdict == "none":
+    if which.verdict in ("none", CANNOT_TELL):
         action = "Refitting its parameters"
     elif which.verdict == "unknown":
         action = "Refitting the parameters and adding the effects found" if found else "Refitting the parameters"

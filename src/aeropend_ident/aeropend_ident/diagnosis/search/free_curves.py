@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +69,12 @@ CHANCE = 3.0
 """Ratio of the share that curves explain of a residual to that of white noise above which it counts (choice).
 
 Measured: at ±30 % no verdict of 25 recordings changes (docs/results/thresholds.md)."""
+
+FOLDS = 5
+"""Blocks of time of a cross-validation (convention)."""
+
+STIFFNESSES = (1e-3, 1e-2, 0.1, 1.0, 10.0)
+"""Weights of the prior on curves, per row, of which cross-validation chooses one (choice: from free to held)."""
 
 MOST_SAMPLES = 100_000
 """Samples of training data in which missing terms are sought.
@@ -382,6 +389,98 @@ def _rows(chain: CutChain, channel: str, response: Mapping[str, Array], count: i
     return response[channel][:, start:s.train][:, known] / s.sigma[channel]
 
 
+@dataclass(frozen=True)
+class _System:
+    """The linear system of a stage: how its residual changes with its parameters and with curves at each place.
+
+    Attributes:
+        residual: (N,) in units of a reading's noise, over all channels.
+        z: (P,) parameters in standard units.
+        jacobian: (P, N) sensitivities to them.
+        fold: (N,) block of time in which a row lies, 0 to `FOLDS` - 1.
+        curves: place -> its curves.
+        basis: place -> (K, N) the change by each value of its curves.
+        random: (D, N) the same by random torques on the arm, if they were asked for.
+    """
+
+    residual: Array
+    z: Array
+    jacobian: Array
+    fold: NDArray[np.intp]
+    curves: Mapping[str, Columns]
+    basis: Mapping[str, Array]
+    random: Array | None
+
+    def solved(self, place: str, spared: Array) -> tuple[MissingTerm, Array]:
+        """The missing term at a place, and what it leaves of rows (D, N) beside the residual."""
+        basis, r, size, rows, information = self._normal(place)
+        solution = -np.linalg.solve(information, rows @ r + np.concatenate([self.z, np.zeros(len(basis))]))
+        rest = r + rows.T @ solution
+        left = spared.T - rows.T @ np.linalg.solve(information, rows @ spared.T)
+        term = MissingTerm(place, _curves(self.curves[place], solution[len(self.z):] / size), float(np.mean(rest**2)),
+                           float(np.mean(r * r)), len(r), effective_sample_size(rest))
+        return term, left
+
+    def _normal(self, place: str) -> tuple[Array, Array, Array, Array, Array]:
+        basis, r = self.basis[place], self.residual
+        size = np.maximum(np.sqrt(np.mean(basis**2, axis=1)), 1e-12)
+        rows = np.vstack([self.jacobian, basis / size[:, None]])
+        stiff = np.full(len(basis), STIFF * len(r) / 1e3)
+        return basis, r, size, rows, rows @ rows.T + np.diag([*np.ones(len(self.z)), *stiff])
+
+    def predicted(self, place: str, stiffness: float) -> float:
+        """Mean square that curves at a place leave of each block of time if they are fitted to all others.
+
+        Args:
+            place: of the curves.
+            stiffness: weight of the prior on the curves, per row.
+        """
+        basis, r = self.basis[place], self.residual
+        rows = basis / np.maximum(np.sqrt(np.mean(basis**2, axis=1)), 1e-12)[:, None]
+        squares = 0.0
+        for k in range(FOLDS):
+            fitted, out = rows[:, self.fold != k], rows[:, self.fold == k]
+            information = fitted @ fitted.T + stiffness * len(r) * np.eye(len(rows))
+            solution = np.linalg.solve(information, fitted @ r[self.fold != k])
+            squares += float(np.sum((r[self.fold == k] - out.T @ solution) ** 2))
+        return squares / len(r)
+
+
+def _system(chains: CutChains, stage: str, base: Mapping[str, float], known: Sequence[Parameter], *,
+            any_time: bool = False, torques: Callable[[int], Array] | None = None) -> _System:
+    """The system of a stage around the values of a fit; arguments as for `missing_terms`."""
+    here = [p for p in known if key(p.name).recording < len(chains.each)]
+    residuals = chains.residuals(stage)
+    search = Search(lambda values: residuals({**base, **values}), started(here, base))
+    jacobian = search.stacked(search.jacobian())
+    channels = [key(k) for k in search.weight]
+    weight = np.concatenate([np.full(len(search.current[k]), w) for k, w in search.weight.items()])
+    fold = np.concatenate([np.arange(len(search.current[k])) * FOLDS // len(search.current[k]) for k in search.weight])
+    values = [chains.values_of(base, k) for k in range(len(chains.each))]
+    variables_of, places_of = _OF_STAGE[stage]
+    variables = [variables_of(chain, own) for chain, own in zip(chains.each, values, strict=True)]
+    knots = {name: knots_of(np.concatenate([v[name][:chain.signals.train]
+                                            for v, chain in zip(variables, chains.each, strict=True)]))
+             for name in variables[0]}
+    made = [places_of(_Stage(chain, own, v, knots, any_time))
+            for chain, own, v in zip(chains.each, values, variables, strict=True)]
+
+    def rows(responses: Sequence[Mapping[str, Array]], count: int) -> Array:
+        return np.concatenate([_rows(chains.each[k.recording], k.name, responses[k.recording], count)
+                               for k in channels], axis=1)
+
+    random = None
+    if torques is not None:
+        moved = [angle_response(chain, own, torques(len(chain.signals)))
+                 for chain, own in zip(chains.each, values, strict=True)]
+        random = rows(moved, len(moved[0]["theta"]))
+    curves = {place: columns for place, (columns, _) in made[0].items()}
+    basis = {place: -rows([m[place][1] for m in made], sum(len(c) for *_, c in columns))
+             for place, columns in curves.items()}
+    return _System(np.concatenate([search.current[k] for k in search.weight]), search.z, jacobian / weight, fold,
+                   curves, basis, random)
+
+
 def missing_terms(chains: CutChains, stage: str, base: Fit, known: Sequence[Parameter], *, any_time: bool = False,
                   torques: Callable[[int], Array] | None = None) -> list[MissingTerm]:
     """The missing term at each place of a stage, the place that explains most first.
@@ -400,48 +499,47 @@ def missing_terms(chains: CutChains, stage: str, base: Fit, known: Sequence[Para
         chains = chains.head(min(MOST_SAMPLES_FREE_IN_TIME, chains.each[0].signals.train))
     else:
         chains = chains.head(MOST_SAMPLES)
-    here = [p for p in known if key(p.name).recording < len(chains.each)]
-    residuals = chains.residuals(stage)
-    search = Search(lambda values: residuals({**base.values, **values}), started(here, base.values))
-    jacobian = search.stacked(search.jacobian())
-    weight = np.concatenate([np.full(len(r), w) for r, w in ((search.current[k], search.weight[k])
-                                                             for k in search.weight)])
-    jacobian = jacobian / weight
-    r = np.concatenate([search.current[k] for k in search.weight])
-    before = float(np.mean(r * r))
-    values = [chains.values_of(base.values, k) for k in range(len(chains.each))]
-    variables_of, places_of = _OF_STAGE[stage]
-    variables = [variables_of(chain, own) for chain, own in zip(chains.each, values, strict=True)]
-    knots = {name: knots_of(np.concatenate([v[name][:chain.signals.train]
-                                            for v, chain in zip(variables, chains.each, strict=True)]))
-             for name in variables[0]}
-    made = [places_of(_Stage(chain, own, v, knots, any_time))
-            for chain, own, v in zip(chains.each, values, variables, strict=True)]
-    random = None
-    if torques is not None:
-        moved = [angle_response(chain, own, torques(len(chain.signals)))
-                 for chain, own in zip(chains.each, values, strict=True)]
-        random = np.concatenate([_rows(chains.each[k.recording], k.name, moved[k.recording],
-                                       len(moved[k.recording]["theta"])) for k in map(key, search.weight)], axis=1)
+    system = _system(chains, stage, base.values, known, any_time=any_time, torques=torques)
+    random = np.zeros((0, len(system.residual))) if system.random is None else system.random
     found = []
-    for place, (curves, _) in made[0].items():
-        count = sum(len(c) for *_, c in curves)
-        basis = np.concatenate([-_rows(chains.each[k.recording], k.name, made[k.recording][place][1], count)
-                                for k in map(key, search.weight)], axis=1)
-        size = np.maximum(np.sqrt(np.mean(basis**2, axis=1)), 1e-12)
-        rows = np.vstack([jacobian, basis / size[:, None]])
-        information = rows @ rows.T + np.diag([*np.ones(len(jacobian)), *np.full(count, STIFF * len(r) / 1e3)])
-        pull = rows @ r + np.concatenate([search.z, np.zeros(count)])
-        solution = -np.linalg.solve(information, pull)
-        rest = r + rows.T @ solution
-        left = float(np.mean(rest * rest))
-        of_random = math.nan
-        if random is not None:
-            spared = random.T - rows.T @ np.linalg.solve(information, rows @ random.T)
-            of_random = float(np.mean(spared**2) / np.mean(random**2))
-        found.append(MissingTerm(place, _curves(curves, solution[len(jacobian):] / size), left, before, len(r),
-                                 effective_sample_size(rest), of_random))
+    for place in system.curves:
+        term, left = system.solved(place, random)
+        of_random = float(np.mean(left**2) / np.mean(random**2)) if len(random) else math.nan
+        found.append(replace(term, left_of_random=of_random))
     return sorted(found, key=lambda term: term.left)
+
+
+@dataclass(frozen=True)
+class Repeatable:
+    """How much of a stage's rest repeats: a function of inputs and states predicts it where it was not fitted.
+
+    Attributes:
+        place: whose curves predict most of it.
+        share: of the mean square above the noise.
+    """
+
+    place: str
+    share: float
+
+
+def repeatable(chains: CutChains, stage: str, values: Mapping[str, float]) -> Repeatable:
+    """The share of a stage's rest that repeats, by cross-validation over blocks of time.
+
+    Free curves at each place are added to the model, fitted to all blocks but one, and judged on that one. The whole
+    recordings count.
+
+    Args:
+        chains: cut.
+        stage: of the chain.
+        values: of the model whose rest is judged.
+    """
+    whole = copy(chains)
+    whole.each = [replace(c, signals=replace(c.signals, train=len(c.signals))) for c in chains.each]
+    system = _system(whole.head(MOST_SAMPLES), stage, values, [])
+    before = float(np.mean(system.residual**2))
+    found = [(system.predicted(place, stiffness), place) for place in system.curves for stiffness in STIFFNESSES]
+    left, place = min(found)
+    return Repeatable(place, min(max((before - left) / max(before - 1.0, 1e-12), 0.0), 1.0))
 
 
 def _curves(columns: Columns, values: Array) -> list[Curve]:

@@ -40,6 +40,20 @@ FIRST_SIZE = 0.3
 
 Measured: at ±30 % no verdict of 25 recordings changes (docs/results/thresholds.md)."""
 
+SMALLER = 0.1
+"""Second size, over the first, from which the search for dry friction starts.
+
+Choice: what sticks at once gives no gradient."""
+
+STICKING = ("coulomb_friction", "rotor_friction")
+"""Effects that can stick."""
+
+REFERENCE_GRAVITY = 33.8
+"""[1/s²] `mgd_over_J` of the rig for which the catalogue's default sizes matter (config/bench.yaml)."""
+
+OF_THE_ARM = ("rad/s²", "1/s²")
+"""Units of sizes that are torques over the arm's inertia: they scale with gravity."""
+
 SAME = 1e-6
 """Change of a residual, in units of a reading's noise, that is rounding (choice).
 
@@ -88,7 +102,7 @@ def hypotheses(model: Model, *, mismatches: bool = True) -> list[Hypothesis]:
         model: the nominal model.
         mismatches: whether each parameter of the model may be far off, too.
     """
-    all_ = [Hypothesis(id_, starts=tuple(_starts(id_))) for id_ in CATALOGUE if id_ not in model.effects]
+    all_ = [Hypothesis(id_, starts=tuple(_starts(id_, model))) for id_ in CATALOGUE if id_ not in model.effects]
     if not mismatches:
         return all_
     for names in STAGES.values():
@@ -101,13 +115,15 @@ def hypotheses(model: Model, *, mismatches: bool = True) -> list[Hypothesis]:
     return all_
 
 
-def _starts(id_: str) -> Iterable[tuple[Parameter, ...]]:
-    """Start points for an effect: a third of its default size, each other parameter at several places of its range."""
+def _starts(id_: str, model: Model) -> Iterable[tuple[Parameter, ...]]:
+    """Start points for an effect: a third of its usual size, each other parameter at several places of its range."""
     effect = CATALOGUE[id_]
     size = effect.parameters[effect.size]
-    step = size.default - size.neutral
+    step = usual_size(id_, model) - size.neutral
     head = Parameter(f"{id_}.{effect.size}", size.neutral, SIZE_SD * abs(step), size.low, size.high,
                      start=size.neutral + FIRST_SIZE * step)
+    if id_ in STICKING:
+        return [(head,), (replace(head, start=size.neutral + SMALLER * FIRST_SIZE * step),)]
     others = [(name, p) for name, p in effect.parameters.items() if name != effect.size]
     if not others:
         return [(head,)]
@@ -124,6 +140,19 @@ def _starts(id_: str) -> Iterable[tuple[Parameter, ...]]:
             grids.append([Parameter(full, middle, half, p.low, p.high, middle + f * half) for f in (-0.6, 0.05, 0.65)])
     # the second parameter is searched; a third starts in its middle
     return [(head, first, *(g[len(g) // 2] for g in grids[1:])) for first in grids[0]]
+
+
+def usual_size(id_: str, model: Model) -> float:
+    """The size of an effect that matters on a rig: the catalogue's default, in the rig's own units.
+
+    Args:
+        id_: of the effect.
+        model: the nominal model of the rig.
+    """
+    size = CATALOGUE[id_].parameters[CATALOGUE[id_].size]
+    if size.unit not in OF_THE_ARM:
+        return size.default
+    return size.neutral + (size.default - size.neutral) * model.model["mgd_over_J"] / REFERENCE_GRAVITY
 
 
 def stages_of(chains: CutChains, hypothesis: Hypothesis) -> tuple[str, ...]:

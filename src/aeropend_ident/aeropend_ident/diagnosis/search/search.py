@@ -85,6 +85,16 @@ def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], No
     return findings
 
 
+def unsearched(chains: CutChains) -> dict[str, Findings]:
+    """The fits of the nominal structure alone, stage by stage, with nothing found."""
+    findings = {}
+    for stage in STAGES:
+        base = fit(chains.residuals(stage), nominal_parameters(chains, stage))
+        findings[stage] = Findings(stage, base, base)
+        chains.set_next_input(stage, base.values)
+    return findings
+
+
 def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
                   acts_on: Mapping[str, tuple[str, ...]], carried: list[Parameter], pool: ThreadPoolExecutor,
                   deadline: float | None) -> Findings:

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What could be closed of the gap at all: what the effects found close, what repeats, and what does not repeat."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+
+from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, STAGES
+from aeropend_ident.diagnosis.document import GapBudget
+from aeropend_ident.diagnosis.free_run_gap import NOTHING_OPEN, Gap
+from aeropend_ident.diagnosis.search import free_curves
+from aeropend_ident.diagnosis.search.free_curves import Repeatable
+
+
+class Repeats:
+    """How much of what each stage leaves repeats; each stage is judged when it is first asked for.
+
+    Args:
+        chains: cut.
+        values: of the augmented model.
+    """
+
+    def __init__(self, chains: CutChains, values: Mapping[str, float]) -> None:
+        self.of_stage = cache(lambda stage: free_curves.repeatable(chains, stage, values))
+
+    def of_channel(self, channel: str) -> Repeatable:
+        """The same for the stage whose misfit a channel shows first."""
+        return self.of_stage(next(stage for stage in STAGES if channel in CHANNELS_OF[stage]))
+
+
+def budget(before: Gap, after: Gap, floors: Mapping[str, float], repeats: Repeats, *, gust: bool) -> GapBudget | None:
+    """The parts of the squared gap above the floor; None where nothing is open.
+
+    Args:
+        before: gap of the nominal model.
+        after: gap of the augmented model.
+        floors: channel -> floor.
+        repeats: how much of the rest repeats.
+        gust: whether `gust` was detected: the rest of the angle is then random.
+    """
+    bottom = before.total_floor(floors)
+    if before.total <= (1.0 + NOTHING_OPEN) * bottom:
+        return None
+    repeatable, rest = 0.0, 0.0
+    places: dict[str, float] = {}
+    for channel, rms in after.rms.items():
+        amount = max(rms**2 - floors[channel] ** 2, 0.0) / after.spread[channel] ** 2 / len(after.rms)
+        one = None if gust and channel == "theta" else repeats.of_channel(channel)
+        if one is not None:
+            places[one.place] = places.get(one.place, 0.0) + one.share * amount
+            repeatable += one.share * amount
+        rest += amount
+    found = max(before.total**2 - after.total**2, 0.0)
+    total = found + rest
+    return GapBudget(found / total, repeatable / total, (rest - repeatable) / total,
+                     max(places, key=lambda p: places[p]) if repeatable > 0.0 else None)
