@@ -251,7 +251,7 @@ def test_what_is_held_out_moves_no_fit():
     columns, _ = rig.record(drawn_rig(77, {"coulomb_friction": {}}), duty, 77)
     spoilt = {name: x.copy() for name, x in columns.items()}
     for x in spoilt.values():
-        x[round(0.7 * len(duty)):] *= 1.1
+        x[round(0.9 * len(duty)):] *= 1.3
     whole, other = (diagnose(BENCH, [from_arrays({**c, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)], 2).body
                     for c in (columns, spoilt))
     for one in (*whole["which"]["candidates"], *other["which"]["candidates"]):

@@ -26,6 +26,7 @@ from aeropend_ident.diagnosis.free_run_gap import HeldOut
 from aeropend_ident.diagnosis.joint_fit import JointFit
 from aeropend_ident.diagnosis.policy import CALIBRATED, angle_only
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis
+from aeropend_ident.diagnosis.search.onset import Onset
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.signals import Signals
 from aeropend_ident.signals.statistics import Z95
@@ -136,7 +137,8 @@ def identified_model(chains: CutChains, joint: JointFit, rows: Mapping[str, Para
 
 
 def candidates(joint: JointFit, statistical: Statistical, held_out: HeldOut, gap_after: float,
-               claimed: Container[str], share: Mapping[str, Interval]) -> tuple[Candidate, ...]:
+               claimed: Container[str], share: Mapping[str, Interval], onset: Onset | None = None
+               ) -> tuple[Candidate, ...]:
     """Every hypothesis that was ranked, the most probable first; a found one with its intervals of the joint fit.
 
     Args:
@@ -146,6 +148,7 @@ def candidates(joint: JointFit, statistical: Statistical, held_out: HeldOut, gap
         gap_after: gap of the augmented model.
         claimed: names of the hypotheses that are part of the verdict.
         share: name -> share of the gap.
+        onset: when the effects found begin or end; None: they act all the time.
     """
     rows: dict[str, Candidate] = {}
     for f in joint.findings.values():
@@ -162,8 +165,9 @@ def candidates(joint: JointFit, statistical: Statistical, held_out: HeldOut, gap
                 whole = {**joint.values, **r.fit.values}
                 estimates = {key(p.name).name: _interval(source[p.name], spread[p.name], p.low, p.high) for p in h.own}
                 after = gap_after if mine else held_out.gap_of(whole).total if r.probability > TRACE else None
+                since, until = (onset.since, onset.until) if onset and mine else (None, None)
                 rows[h.name] = Candidate(h.effect, h.place, r.probability, estimates, h.name in claimed, after,
-                                         share.get(h.name) if mine else None)
+                                         share.get(h.name) if mine else None, since, until)
     for extra in statistical.found:
         h = extra.hypothesis
         estimates = {key(n).name: _interval(v, extra.fit.sd[n], 0.0) for n, v in extra.fit.values.items()}

@@ -38,14 +38,15 @@ from aeropend_ident.diagnosis.document import (
 )
 from aeropend_ident.diagnosis.document import UnknownEffect as DrawnEffect
 from aeropend_ident.diagnosis.experiment_design import EXPERIMENTS, experiments_within
-from aeropend_ident.diagnosis.free_run_gap import Gap, HeldOut, closure
+from aeropend_ident.diagnosis.free_run_gap import Gap, HeldOut, closure, gap
 from aeropend_ident.diagnosis.gap_budget import Repeats, budget
 from aeropend_ident.diagnosis.gap_share import MATERIAL_SHARE, Part
 from aeropend_ident.diagnosis.joint_fit import JointFit, fit_jointly
 from aeropend_ident.diagnosis.policy import GOOD_ENOUGH, policy_of
-from aeropend_ident.diagnosis.search import gust, speed_spikes, unknown_effect
+from aeropend_ident.diagnosis.search import gust, onset, speed_spikes, unknown_effect
 from aeropend_ident.diagnosis.search.findings import Findings
 from aeropend_ident.diagnosis.search.free_curves import MissingTerm, Repeatable
+from aeropend_ident.diagnosis.search.onset import Onset
 from aeropend_ident.diagnosis.search.search import refit, search, unsearched
 from aeropend_ident.diagnosis.search.unknown_effect import UnknownEffect
 from aeropend_ident.estimation.parameter import key
@@ -57,6 +58,13 @@ Array = NDArray[np.float64]
 
 CUT_SHORT = ("the search was cut short to bound its time: an effect beside the first, or a rival close to it, may have "
              "been missed; --seconds says how long it may take")
+
+
+CHANGED = 1.5
+"""RMS early in the held-out part over that in the fitted part above which the rig changes there (choice)."""
+
+FURTHEST = 0.9
+"""Share of such a recording that is fitted (choice: two thirds of what is usually held out)."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +148,7 @@ class _Findings:
         misfit: of the nominal structure where it fits worst.
         recordings: with the notes of the search.
         failed: why the nominal model could not be identified; "" if it was.
+        onset: when the effects begin or end; None: they act all the time.
     """
 
     chains: CutChains
@@ -149,6 +158,7 @@ class _Findings:
     misfit: regions.Misfit
     recordings: Sequence[Signals]
     failed: str = ""
+    onset: Onset | None = None
 
 
 @dataclass(frozen=True)
@@ -196,6 +206,8 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     found = _find(fitted, settings, progress)
     progress("fitting all jointly", 0.75)
     found, joint, gaps = _fit_and_measure(fitted, found, progress)
+    if _changes_later(gaps):
+        return _diagnose(_fitted_further(fitted), settings, progress)
     if found.unknown is not None and gaps.after.within(gaps.floors, CHANNELS_OF[found.unknown.stage]):
         found = replace(found, unknown=None)
     parts = _parts(found, joint, gaps, settings.jobs)
@@ -215,6 +227,30 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     progress("done", 1.0)
     return Diagnosis(nominal, _augmented(model, joint.values, found.statistical), found.recordings, gaps.runs_before,
                      gaps.runs_after, conclusions, found.misfit)
+
+
+def _changes_later(gaps: _Gaps) -> bool:
+    """Whether the rig changes early in the held-out part: what was fitted then says nothing of the change."""
+    s = gaps.held_out.recordings[0]
+    further = _further(s)
+    if len(gaps.held_out.recordings) > 1 or not gaps.held_out.chains.policy.calibrated or s.train >= further:
+        return False
+    there = gap(gaps.runs_after[0], s, s.train, further, s.false_speed if gaps.held_out.spikes else None)
+    return any(rms > CHANGED * max(gaps.fitted.rms[c], gaps.floors[c])
+               for c, rms in there.rms.items() if c in gaps.fitted.rms)
+
+
+def _fitted_further(fitted: CutChains) -> CutChains:
+    """The chains of a recording that is fitted further."""
+    (s,) = fitted.recordings
+    further = _further(s)
+    note = (f"after {s.train * s.period:.1f} s the rig behaves otherwise than before: the fit goes on up to "
+            f"{further * s.period:.1f} s, only the rest is held out")
+    return type(fitted)(fitted.model, [replace(s, train=further).noted(note)], fitted.policy)
+
+
+def _further(s: Signals) -> int:
+    return round(FURTHEST * len(s))
 
 
 def _fit_and_measure(fitted: CutChains, found: _Findings, progress: Progress) -> tuple[_Findings, JointFit, _Gaps]:
@@ -266,8 +302,13 @@ def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Finding
     if not fitted.policy.driven:  # a decay has few swings: effects are selected on all of them
         chains = CutChains(fitted.model, [replace(s, train=len(s)) for s in recordings], fitted.policy)
     deadline = None if settings.seconds is None else time.monotonic() + settings.seconds
-    stages = search(chains, settings.jobs,
-                    lambda stage, share: progress(f"searching effects of the {stage}", 0.7 * share), deadline)
+
+    def searched(chains: CutChains) -> dict[str, Findings]:
+        return search(chains, settings.jobs,
+                      lambda stage, share: progress(f"searching effects of the {stage}", 0.7 * share), deadline)
+
+    chains, stages, begun = onset.search_within_windows(chains, searched(chains), searched)
+    recordings = chains.recordings
     if any(f.cut_short for f in stages.values()):
         recordings = [s.noted(CUT_SHORT) for s in recordings]
     progress("testing for random effects", 0.7)
@@ -276,7 +317,7 @@ def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Finding
     stages = {**stages, "arm": detected.arm}
     misfit = regions.largest_misfit(chains, stages)
     unknown = unknown_effect.judge(chains, stages, gust=detected.gust is not None, spikes=spikes is not None)
-    return _Findings(chains, stages, Statistical(detected.gust, spikes), unknown, misfit, recordings)
+    return _Findings(chains, stages, Statistical(detected.gust, spikes), unknown, misfit, recordings, onset=begun)
 
 
 def _measure(fitted: CutChains, found: _Findings, joint: JointFit) -> _Gaps:
@@ -286,7 +327,7 @@ def _measure(fitted: CutChains, found: _Findings, joint: JointFit) -> _Gaps:
     base = {n: v for f in found.stages.values() for n, v in f.base.values.items()
             if key(n).is_initial or not chains.policy.calibrated}
     values: Mapping[str, float] = joint.values
-    if fitted is not chains:  # what was selected on the whole decay is fitted again to its training part
+    if not chains.policy.driven:  # what was selected on the whole decay is fitted again to its training part
         base = refit(fitted, "arm", [], base).values
         values = refit(fitted, "arm", found.stages["arm"].effects, values).values
     held_out = HeldOut(chains, model, found.recordings, spikes=found.statistical.spikes is not None)
@@ -304,7 +345,8 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
     head = gap_share.headline(parts, share, settings.material)
     if found.failed:
         head = replace(head, verdict=CANNOT_TELL, place="none")
-    candidates = conclude.candidates(joint, found.statistical, gaps.held_out, gaps.after.total, head.claimed, share)
+    candidates = conclude.candidates(joint, found.statistical, gaps.held_out, gaps.after.total, head.claimed, share,
+                                     found.onset)
     reasons = [f"{c} is off by {x:.1f} times a reading's noise"
                for c, x in _left(stages, gust=found.statistical.gust is not None).items() if x > GOOD_ENOUGH]
     reasons = [found.failed] if found.failed else reasons

@@ -111,6 +111,8 @@ class Candidate:
         found: whether it is part of the verdict.
         gap_after: [share of the spread] total gap with it; null if it was not computed.
         share: [0..1] its share of the gap, which comes back without it; null if it is not in the augmented model.
+        since: [s] when it begins, if that is not at the start of the recording.
+        until: [s] when it ends, if that is not at the end of the recording.
     """
 
     effect: str
@@ -120,6 +122,8 @@ class Candidate:
     found: bool
     gap_after: float | None
     share: Interval | None = None
+    since: Interval | None = None
+    until: Interval | None = None
 
 
 @dataclass(frozen=True)

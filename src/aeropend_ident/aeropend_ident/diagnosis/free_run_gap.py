@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
-from aeropend_ident.diagnosis.chain.values import with_values
+from aeropend_ident.diagnosis.chain.values import with_values, without_effects
 from aeropend_ident.signals.pulses import mean_speed
 from aeropend_ident.signals.signals import CHANNELS, Signals
 from aeropend_sim.model import actuator, dynamics, sensing
@@ -57,18 +57,37 @@ def free_run(model: Model, signals: Signals, values: Mapping[str, float] | None 
         Channel -> (N,) readings before noise and quantisation.
     """
     values = values or {}
-    m = with_values(model, values)
-    n, omega = m.numbers(), values.get("initial.omega", 0.0)
+    omega = values.get("initial.omega", 0.0)
+    off = without_effects(values, model)
+    pieces = [(piece, with_values(model, values if acts else off)) for piece, acts in signals.acting()]
+    n = pieces[0][1].numbers()
     state = dynamics.State(i_a=float(actuator.current_at(n, omega)), omega=omega,
                            theta=values.get("initial.theta", 0.0), theta_dot=values.get("initial.theta_dot", 0.0),
                            thrust=float(actuator.thrust(n, omega)))
-    run = dynamics.simulate(m, signals.duty, signals.period, state)
-    return {
-        "theta": sensing.angle_reading(run.theta, run.theta_dot, sensing.prepare(m, signals.period)),
-        "omega": _held_speed(run, signals),
-        "i_a": sensing.read_current(m, run.i_a),
-        "v_a": sensing.read_voltage(m, run.v_a),
-    }
+    run = _simulated(signals, pieces, state)
+    out = {"theta": np.empty(len(signals)), "omega": _held_speed(run, signals), "i_a": np.empty(len(signals)),
+           "v_a": np.empty(len(signals))}
+    for piece, m in pieces:
+        reading = sensing.angle_reading(run.theta, run.theta_dot, sensing.prepare(m, signals.period))
+        out["theta"][piece] = reading[piece]
+        out["i_a"][piece] = sensing.read_current(m, run.i_a[piece])
+        out["v_a"][piece] = sensing.read_voltage(m, run.v_a[piece])
+    return out
+
+
+def _simulated(signals: Signals, pieces: Sequence[tuple[slice, Model]], state: dynamics.State) -> dynamics.Trajectory:
+    """The run of the whole chain, piece by piece; see `dynamics.simulate`."""
+    out = np.empty((7, len(signals)))
+    duty = np.ascontiguousarray(signals.duty, dtype=float)
+    for piece, m in pieces:
+        v, sampled = actuator.voltages(m.numbers(), duty, m.effects, signals.period, -piece.start)
+        c, e, x = dynamics.prepare(m, signals.period)
+        part = np.empty((7, piece.stop - piece.start))
+        state = dynamics.run(v[piece], np.zeros(part.shape[1]), state, c, e, x, part)
+        if "command_delay" in m.effects:
+            part[dynamics.ROW.v_a] += (sampled - v)[piece]
+        out[:, piece] = part
+    return dynamics.Trajectory(*out)
 
 
 def _held_speed(run: dynamics.Trajectory, signals: Signals) -> Array:

@@ -130,9 +130,9 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
     if document.identified is not None:
         lines.append(f"  {identified_line(document.identified, which.numbers)}")
     lines.append(gap_line("gap on held-out data", closure))
-    fits = [f"{c} {_percent(one.fit_fitted)} % on the fitted part, {_percent(one.fit_unseen)} % on the unseen one"
-            for c, one in document.channels.items()]
-    lines.append(f"  fit of the free run: {'; '.join(fits)}")
+    if (angle := document.channels.get("theta")) is not None:
+        lines.append(f"  fit of the angle in a free run: {_percent(angle.fit_fitted)} % on the fitted part, "
+                     f"{_percent(angle.fit_unseen)} % on the unseen one")
     if closure.budget is not None:
         lines.append(budget_line(closure.budget))
     lines += [gap_line(f"gap on {across.bag}, not fitted to", across) for across in closure.across]
@@ -207,4 +207,6 @@ def describe(candidate: Candidate) -> str:
     """A candidate's parameters with units and 95 % intervals, and its share of the gap."""
     texts = [f"{name} = {p.value:.4g} ({p.low:.4g} to {p.high:.4g}) {unit_of(candidate.effect, name)}"
              for name, p in candidate.parameters.items()]
-    return ", ".join(texts) + (f"; {of_the_gap(candidate.share)}" if candidate.share else "")
+    when = [f"; {word} at {t.value:.2f} s ({t.low:.2f} to {t.high:.2f} s)"
+            for word, t in (("begins", candidate.since), ("ends", candidate.until)) if t]
+    return ", ".join(texts) + "".join(when) + (f"; {of_the_gap(candidate.share)}" if candidate.share else "")

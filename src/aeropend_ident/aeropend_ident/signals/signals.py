@@ -59,6 +59,8 @@ class Signals:
         false_speed: (N,) true where omega is wrong: a false capture, or an outlier.
         train: number of samples that models are fitted to; the rest is held out.
         notes: remarks on the data for a person.
+        window: first sample at which effects act that the model lacks, and the first at which they act no more; None:
+            they act all the time.
     """
 
     period: float
@@ -72,6 +74,7 @@ class Signals:
     false_speed: NDArray[np.bool_]
     train: int
     notes: tuple[str, ...] = ()
+    window: tuple[int, int] | None = None
 
     def __len__(self) -> int:
         return len(self.duty)
@@ -87,6 +90,19 @@ class Signals:
     def noted(self, *notes: str) -> Signals:
         """The same recording with further notes."""
         return replace(self, notes=(*self.notes, *notes))
+
+    def acting(self, stop: int | None = None) -> list[tuple[slice, bool]]:
+        """The pieces of the recording, and whether the effects that the model lacks act in each.
+
+        Args:
+            stop: sample at which the last piece ends; None: the end.
+        """
+        end = len(self) if stop is None else min(stop, len(self))
+        if self.window is None:
+            return [(slice(0, end), True)]
+        first, last = (min(k, end) for k in self.window)
+        pieces = [(slice(0, first), False), (slice(first, last), True), (slice(last, end), False)]
+        return [(piece, acts) for piece, acts in pieces if piece.stop > piece.start]
 
     @property
     def samples(self) -> int:

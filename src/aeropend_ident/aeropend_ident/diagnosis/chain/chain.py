@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis.chain.values import STAGES, Values, with_values
+from aeropend_ident.diagnosis.chain.values import STAGES, Values, with_values, without_effects
 from aeropend_ident.diagnosis.policy import CALIBRATED, Policy
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.pulses import mean_speed
@@ -87,6 +87,11 @@ class CutChain:
         """The model with these values."""
         return with_values(self.model, values)
 
+    def pieces(self, values: Values, stop: int | None = None) -> list[tuple[slice, Model]]:
+        """The pieces of the recording with the model that acts in each: effects may begin or end."""
+        off = without_effects(values, self.model) if self.signals.window is not None else values
+        return [(piece, self.valued(values if acts else off)) for piece, acts in self.signals.acting(stop)]
+
     # --- actuator: duty -> voltage
 
     def actuator(self, values: Values) -> Array:
@@ -94,12 +99,15 @@ class CutChain:
         return self._voltage(values, actuator.sampled_voltage)
 
     def _voltage(self, values: Values, of: Callable[..., Array]) -> Array:
-        s, m = self.signals, self.valued(values)
-        n = m.numbers()
-        # the duty before the recording is taken from the first voltage: with a delay it acts for a while
-        first = s.v_a[0] if np.isfinite(s.v_a[0]) else actuator.voltage_at(n, values.get("initial.omega", 0.0))
-        v = of(n, s.duty, m.effects, s.period, before=float(actuator.duty(n, first)))
-        return sensing.read_voltage(m, actuator.terminal_voltage(m, v, self.current))
+        s = self.signals
+        out = np.empty(len(s))
+        for piece, m in self.pieces(values):
+            n = m.numbers()
+            # the duty before the recording is taken from the first voltage: with a delay it acts for a while
+            first = s.v_a[0] if np.isfinite(s.v_a[0]) else actuator.voltage_at(n, values.get("initial.omega", 0.0))
+            v = of(n, s.duty, m.effects, s.period, start=-piece.start, before=float(actuator.duty(n, first)))
+            out[piece] = sensing.read_voltage(m, actuator.terminal_voltage(m, v[piece], self.current[piece]))
+        return out
 
     def actuator_residuals(self, values: Values) -> dict[str, Array]:
         """Residual of the voltage over the training part, in units of its noise."""
@@ -150,18 +158,20 @@ class CutChain:
         Returns:
             [A] current, [rad/s] speed and [rad] rotor angle, (N,) each.
         """
-        m = self.valued(values)
-        # the supply acts before the terminals: the measured voltage holds its sag
-        m = m.with_effects({k: p for k, p in m.effects.items() if k != "supply_sag"})
         first = float(self.signals.i_a[0]) if np.isfinite(self.signals.i_a[0]) else 0.0
         state = dynamics.State(i_a=first, omega=values.get("initial.omega", 0.0))
         if not self.signals.has("v_a"):
             voltage = self._voltage(values, actuator.acting_voltage)
         else:
             voltage = self._motor_input(values) if DELAY in values else self.voltage
-        voltage = sensing.true_voltage(m, voltage[:stop])
-        out = np.empty((3, len(voltage)))
-        dynamics.run_motor(voltage, state, *dynamics.prepare(m, self.signals.period), out)
+        out = np.empty((3, len(voltage[:stop])))
+        for piece, whole in self.pieces(values, stop):
+            # the supply acts before the terminals: the measured voltage holds its sag
+            m = whole.with_effects({k: p for k, p in whole.effects.items() if k != "supply_sag"})
+            true = sensing.true_voltage(m, voltage[piece])
+            part = np.empty((3, len(true)))
+            state = dynamics.run_motor(true, state, *dynamics.prepare(m, self.signals.period), part)
+            out[:, piece] = part
         return out[0], out[1], out[2]
 
     def motor_residuals(self, values: Values) -> dict[str, Array]:
@@ -170,8 +180,8 @@ class CutChain:
         i_a, omega, angle = self.motor(values, s.train)
         residuals = {}
         if s.has("i_a"):
-            read = sensing.read_current(self.valued(values), i_a)
-            residuals["i_a"] = self._train(s.i_a, read) / s.sigma["i_a"]
+            read = [sensing.read_current(m, i_a[piece]) for piece, m in self.pieces(values, s.train)]
+            residuals["i_a"] = self._train(s.i_a, np.concatenate(read)) / s.sigma["i_a"]
         if s.pulses is not None:
             p = s.pulses
             use = (p.index < s.train) & ~p.false
@@ -201,12 +211,15 @@ class CutChain:
     def arm(self, values: Values, stop: int | None = None) -> Array:
         """[rad] Angle (N,) as it would be read, before noise and quantisation; arguments as for `motor`."""
         theta, rate = self.arm_motion(values, stop)
-        return sensing.angle_reading(theta, rate, sensing.prepare(self.valued(values), self.signals.period))
+        s, out = self.signals, np.empty(len(theta))
+        for piece, m in self.pieces(values, stop):
+            out[piece] = sensing.angle_reading(theta, rate, sensing.prepare(m, s.period))[piece]
+        return out
 
     def arm_motion(self, values: Values, stop: int | None = None) -> tuple[Array, Array]:
         """True angle [rad] and angular rate [rad/s], (N,) each; arguments as for `motor`."""
-        s, m = self.signals, self.valued(values)
-        n = m.numbers()
+        s = self.signals
+        n = self.pieces(values)[0][1].numbers()
         cut = s.has("omega") or s.has("i_a")
         if not cut and not s.duty.any() and "initial.omega" not in values and actuator.voltage(n, 0.0) == 0.0:
             speed = np.zeros(len(s))[:stop]  # the rotor stands
@@ -216,7 +229,10 @@ class CutChain:
                                theta_dot=values.get("initial.theta_dot", 0.0),
                                thrust=float(actuator.thrust(n, speed[0])))
         out = np.empty((2, len(speed)))
-        dynamics.run_arm(speed, state, *dynamics.prepare(m, s.period), out)
+        for piece, m in self.pieces(values, stop):
+            part = np.empty((2, piece.stop - piece.start))
+            state = dynamics.run_arm(speed[piece], state, *dynamics.prepare(m, s.period), part)
+            out[:, piece] = part
         return out[0], out[1]
 
     def arm_residuals(self, values: Values) -> dict[str, Array]:

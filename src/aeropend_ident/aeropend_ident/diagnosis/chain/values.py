@@ -57,6 +57,11 @@ def with_values(model: Model, values: Values) -> Model:
     return Model(model.name, numbers, measuring, effects)
 
 
+def without_effects(values: Values, model: Model) -> dict[str, float]:
+    """The values without those of effects that the model lacks."""
+    return {n: v for n, v in values.items() if key(n).owner not in CATALOGUE or key(n).owner in model.effects}
+
+
 def neutral(model: Model, name: str) -> float:
     """The value at which an effect is absent, or a parameter is nominal."""
     k = key(name)

@@ -40,6 +40,7 @@ class CandidateRow:
         gap_after: [share of the spread] total gap with it; None if it was not computed.
         found: whether it is part of the verdict.
         share: of the gap, as a text; "" if it is not in the augmented model.
+        when: it begins or ends, as a text; "" if it acts all the time.
     """
 
     effect: str
@@ -51,6 +52,7 @@ class CandidateRow:
     gap_after: float | None
     found: bool
     share: str
+    when: str
 
     @property
     def name(self) -> str:
@@ -120,4 +122,14 @@ def _row(c: Candidate) -> CandidateRow:
     physics = minus(f"{PARAMETERS[f'model.{parameter}'].description}; its value is off" if parameter
                     else CATALOGUE[c.effect].physics)
     return CandidateRow(c.effect, parameter, c.place, physics, c.probability, estimates, c.gap_after, c.found,
-                        share_text(c.share) if c.share else "")
+                        share_text(c.share) if c.share else "", _when(c))
+
+
+def _when(c: Candidate) -> str:
+    """When a candidate begins or ends."""
+    texts = []
+    for word, t in (("begins", c.since), ("ends", c.until)):
+        if t is not None:
+            value, between = interval(t.value, t.low, t.high)
+            texts.append(f"{word} at {with_unit(value, 's')} ({between})")
+    return ", ".join(texts)

@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Effects that begin or end during a recording.
+
+Where a stage is not explained, each effect is tried as if it acted only from an instant on, or only until then. To
+first order this is one least-squares solve for each instant; cumulative sums make it as cheap as one. If an instant
+stands out, the whole search is made again with effects that act only there, and the better search counts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
+from aeropend_ident.diagnosis.chain.priors import nominal_parameters
+from aeropend_ident.diagnosis.chain.values import STAGES
+from aeropend_ident.diagnosis.document import Interval
+from aeropend_ident.diagnosis.policy import MATERIAL
+from aeropend_ident.diagnosis.search.findings import Findings
+from aeropend_ident.diagnosis.search.hypotheses import EFFECT_ODDS, Hypothesis, hypotheses, stages_of
+from aeropend_ident.diagnosis.search.search import passes_as_noise
+from aeropend_ident.estimation.map_fit import Fit, Search, fit, largest_ess
+from aeropend_ident.estimation.parameter import Parameter, key, started
+from aeropend_ident.signals.signals import Signals
+
+Array = NDArray[np.float64]
+Window = tuple[int, int]
+"""First sample at which an effect acts, and the first at which it acts no more."""
+
+GRID = 0.25
+"""[s] Distance of the instants that are tried first (choice: the fit then moves the best one)."""
+
+SHORTEST = 2.0
+"""[s] Shortest time with and without the effect (choice: some time constants of the arm)."""
+
+STANDS_OUT = 5.0
+"""Log likelihood by which an effect with an instant must beat what the search found for the search to be made again.
+
+Choice: the search itself decides; this only saves time."""
+
+FOLLOWED, PASSES, ROUNDS = 4, 2, 2
+"""Effects that are fitted with their windows, how often the window is moved, and rounds of each fit (choice)."""
+
+NEAR = 0.05
+"""[s] Distance of an instant from its estimate within which the search is not made again (choice: a tenth of what
+counts as found)."""
+
+FINER = 5
+"""Ratio of the distances of two passes that move the instant (choice)."""
+
+WITHIN = 1.92
+"""Log likelihood below its maximum at the ends of a 95 % interval (derived: half the 95 % quantile of χ² of one)."""
+
+
+@dataclass(frozen=True)
+class Onset:
+    """When an effect begins or ends.
+
+    Attributes:
+        window: in which the effects found act.
+        since: [s] when they begin; None: from the start.
+        until: [s] when they end; None: to the end.
+    """
+
+    window: Window
+    since: Interval | None
+    until: Interval | None
+
+
+def search_within_windows(chains: CutChains, findings: dict[str, Findings],
+                          searched: Callable[[CutChains], dict[str, Findings]]
+                          ) -> tuple[CutChains, dict[str, Findings], Onset | None]:
+    """Search again with effects that begin or end, if an instant stands out.
+
+    Args:
+        chains: cut.
+        findings: of the search with effects that act all the time.
+        searched: makes a search.
+
+    Returns:
+        The chains, the findings and the onset of the better search; without an onset those that were given.
+    """
+    window = suspected(chains, findings)
+    for _ in range(PASSES if window else 0):
+        assert window is not None
+        again = with_window(chains, window)
+        within = searched(again)
+        if not is_better(findings, within, chains.recordings[0]):
+            break
+        onset = located(again, within)
+        if abs(sum(onset.window) - sum(window)) * chains.recordings[0].period < NEAR:
+            return again, within, onset
+        window = onset.window
+    else:
+        return (again, within, onset) if window else (chains, findings, None)
+    return chains, findings, None
+
+
+def suspected(chains: CutChains, findings: Mapping[str, Findings]) -> Window | None:
+    """The window that explains most in the first stage that is not explained; None: none stands out.
+
+    Args:
+        chains: cut; of several recordings, and of an uncalibrated rig, whose searches are long, none is suspected.
+        findings: what the search found with effects that act all the time.
+    """
+    if len(chains.each) > 1 or not chains.policy.calibrated:
+        return None
+    every = hypotheses(chains.model, mismatches=False)
+    for stage in STAGES:
+        f = findings[stage]
+        if not f.base.residuals or passes_as_noise(f.final, MATERIAL):
+            continue
+        mine = [h for h in every if stages_of(chains, h)[:1] == (stage,)]
+        return _best_window(chains, stage, f, mine)
+    return None
+
+
+def with_window(chains: CutChains, window: Window) -> CutChains:
+    """The chains of one recording cut again, with effects that act only within a window."""
+    (signals,) = chains.recordings
+    return type(chains)(chains.model, [replace(signals, window=window)], chains.policy)
+
+
+def is_better(once: Mapping[str, Findings], again: Mapping[str, Findings], signals: Signals) -> bool:
+    """Whether a search with a window has more evidence than one without, its instant and its prior odds included."""
+    tried = 2.0 * signals.train * signals.period / GRID
+    gain = math.log(EFFECT_ODDS / tried)
+    for stage, f in again.items():
+        ess = largest_ess([f.final, once[stage].final])
+        gain += f.final.log_evidence(ess) - once[stage].final.log_evidence(ess)
+    return gain > 0.0 and any(f.found for f in again.values())
+
+
+def located(chains: CutChains, findings: Mapping[str, Findings]) -> Onset:
+    """Move the instant of a window to where the findings fit best, with its interval by the profile likelihood.
+
+    Args:
+        chains: of one recording, cut with a window.
+        findings: of the search with this window.
+    """
+    window, inside = _located(chains.each[0], {b: f.final for b, f in findings.items() if f.found})
+    period = chains.each[0].signals.period
+    begins = window[0] > 0
+    at = Interval(window[not begins] * period, (min(inside) - 1) * period, (max(inside) + 1) * period)
+    return Onset(window, at if begins else None, None if begins else at)
+
+
+def _located(chain: CutChain, fits: Mapping[str, Fit]) -> tuple[Window, list[int]]:
+    """The window whose instant fits best, and the instants within its 95 % interval."""
+    window = chain.signals.window
+    assert window is not None
+    begins = window[0] > 0
+
+    def cost(k: int) -> float:
+        moved = _windowed(chain, _moved(window, k, begins=begins))
+        return sum(0.5 * f.ess[channel] * float(np.mean(r * r)) / f.scale[channel] ** 2
+                   for b, f in fits.items() for channel, r in moved.residuals(b)(f.values).items())
+
+    best = window[not begins]
+    step, costs = max(round(GRID / chain.signals.period / 2), 1), dict[int, float]()
+    while True:
+        near = [k for k in range(best - 4 * step, best + 4 * step + 1, step) if 0 < k < len(chain.signals)]
+        costs.update({k: cost(k) for k in near if k not in costs})
+        best = min(costs, key=lambda k: costs[k])
+        if step == 1 and near[0] < best < near[-1]:
+            break
+        if near[0] < best < near[-1]:
+            step = max(step // FINER, 1)
+    return _moved(window, best, begins=begins), [k for k, c in costs.items() if c < costs[best] + WITHIN]
+
+
+def _windowed(chain: CutChain, window: Window) -> CutChain:
+    return replace(chain, signals=replace(chain.signals, window=window))
+
+
+def _moved(window: Window, k: int, *, begins: bool) -> Window:
+    return (k, window[1]) if begins else (window[0], k)
+
+
+def _best_window(chains: CutChains, stage: str, f: Findings, candidates: Sequence[Hypothesis]) -> Window | None:
+    """The window in which an effect explains most of the misfit, if it stands out."""
+    chain = chains.each[0]
+    signals = chain.signals
+    known = [p for p in nominal_parameters(chains, stage) if p.name in f.base.values]
+    residuals = chains.residuals(stage)
+    search = Search(lambda values: residuals({**f.base.values, **values}), started(known, f.base.values))
+    weight = np.concatenate([np.full(len(search.current[k]), w) for k, w in search.weight.items()])
+    jacobian = search.stacked(search.jacobian()) / weight
+    r = np.concatenate([search.current[k] for k in search.weight])
+    at = np.concatenate([rows_of(chain, key(k).name) for k in search.weight])
+    order = np.argsort(at, kind="stable")
+    edge = round(SHORTEST / signals.period)
+    instants = np.arange(edge, signals.train - edge, max(round(GRID / signals.period), 1))
+    if not len(instants):
+        return None
+    cuts = np.searchsorted(at[order], instants)
+    information = jacobian @ jacobian.T + np.eye(len(known))
+    inverse = np.linalg.inv(information)
+    pull = inverse @ (jacobian @ r + search.z)
+
+    def gains(column: Array) -> tuple[Array, Array]:
+        """Cost explained by a column that acts from each instant on, and until each instant."""
+        products = np.vstack([column * r, column * column, jacobian * column])[:, order]
+        total = products.sum(axis=1, keepdims=True)
+        before = np.concatenate([np.zeros((len(products), 1)), np.cumsum(products, axis=1)], axis=1)[:, cuts]
+
+        def explained(p: Array) -> Array:
+            cross = p[0] - pull @ p[2:]
+            size = p[1] - np.einsum("jk,jl,lk->k", p[2:], inverse, p[2:])
+            return np.where(size > 1e-9 * total[1], cross**2 / np.maximum(size, 1e-300), 0.0)
+
+        return explained(total - before), explained(before)
+
+    found: list[tuple[float, Window, tuple[Parameter, ...]]] = []
+    for h in candidates:
+        for own in h.starts:
+            moved = residuals({**f.base.values, **{p.name: p.begin for p in own}})
+            column = np.concatenate([moved[k] for k in search.weight]) - r
+            if not np.isfinite(column).all() or not column.any():
+                continue
+            since, until = gains(column)
+            for gain, begins in ((since, True), (until, False)):
+                k = int(np.argmax(gain))
+                window = (int(instants[k]), len(signals)) if begins else (0, int(instants[k]))
+                found.append((float(gain[k]), window, own))
+    if not found:
+        return None
+    found.sort(key=lambda one: -one[0])
+    tried = [_fitted(chain, stage, f.base, known, window, own) for _, window, own in found[:FOLLOWED]]
+    best, window = min(tried, key=lambda one: one[0].mean_square)
+    ess = largest_ess([best, f.final])
+    return window if best.log_likelihood(ess) - f.final.log_likelihood(ess) > STANDS_OUT else None
+
+
+def _fitted(chain: CutChain, stage: str, base: Fit, known: Sequence[Parameter], window: Window,
+            own: Sequence[Parameter]) -> tuple[Fit, Window]:
+    """Fit an effect that acts within a window, and move the window."""
+    f = base
+    for _ in range(PASSES):
+        f = fit(_windowed(chain, window).residuals(stage), started([*known, *own], {**f.values}), ROUNDS)
+        window, _ = _located(_windowed(chain, window), {stage: f})
+    return f, window
+
+
+def rows_of(chain: CutChain, channel: str) -> NDArray[np.intp]:
+    """The sample of each row of a channel's residual."""
+    s = chain.signals
+    if channel == "omega" and s.pulses is not None:
+        p = s.pulses
+        return np.asarray(p.index[(p.index < s.train) & ~p.false])
+    start = s.after_unseen if channel == "v_a" else 0
+    measured = s.true_speed if channel == "omega" else s.channel(channel)
+    return start + np.flatnonzero(np.isfinite(measured[start:s.train]))
+
