@@ -15,26 +15,17 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
-import time
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from joblib import Parallel, delayed
-from rich.progress import Progress
 
 from aeropend_ident.bags import recording
-from aeropend_ident.diagnosis.diagnosis import diagnose
-from aeropend_ident.diagnosis.document import to_json
-from aeropend_ident.diagnosis.results import document
 from aeropend_ident.signals.from_bag import from_recording
 from aeropend_ident.testing import bags
 from aeropend_sim.model.parameters import load
-from evaluation.blind import cases, circumstances, limit, page, peers, plant, report, score, uncalibrated
+from evaluation.blind import cases, circumstances, folder, limit, page, peers, plant, report, score, uncalibrated
 
-MODEL = "bench"
-SEALED = "labels.sealed"
 SPARSE, BIC = "sparse regression of the discrepancy (pysindy)", "stepwise BIC on output error"
 SHARES = {"single": 0.54, "none": 0.18, "two": 0.14, "outside": 0.14}
 
@@ -58,7 +49,7 @@ def plan(count: int, seed: int) -> list[tuple[str, list[str], str, bool]]:
 
 def make(out: Path, count: int, seed: int, duration: float, jobs: int) -> None:
     """Make the recordings, and seal their labels."""
-    nominal = load(MODEL)
+    nominal = load(folder.MODEL)
 
     def one(k: int, row: tuple[str, list[str], str, bool]) -> dict[str, object]:
         kind, effects, form, closed = row
@@ -67,35 +58,12 @@ def make(out: Path, count: int, seed: int, duration: float, jobs: int) -> None:
         bags.write(out / "recordings" / case.name, columns, round(plant.PERIOD * 1e9))
         return case.label()
 
-    (out / "recordings").mkdir(parents=True)
-    rows = plan(count, seed)
-    labels = list(_shown("making recordings", rows, one, jobs))
-    (out / SEALED).write_bytes(zlib.compress(json.dumps(labels).encode()))
-
-
-def diagnose_all(out: Path, jobs: int, only: list[str]) -> None:
-    """Write a verdict for each recording; the labels stay sealed."""
-    model = load(MODEL)
-    (out / "verdicts").mkdir(exist_ok=True)
-
-    def one(_: int, name: str) -> None:
-        started = time.perf_counter()
-        path = out / "recordings" / name
-        try:
-            result = diagnose(model, [from_recording(recording.read(str(path)), model.sensing)], 1)
-            body = to_json(document(result, [name], MODEL, time.perf_counter() - started))
-        except recording.RecordingError as error:
-            body = {"error": str(error), "seconds": time.perf_counter() - started}
-        (out / "verdicts" / f"{name}.json").write_text(json.dumps(body))
-
-    names = sorted(p.name for p in (out / "recordings").iterdir())
-    for _ in _shown("diagnosing", [n for n in names if not only or n in only], one, jobs):
-        pass
+    folder.make_all(out, plan(count, seed), one, jobs)
 
 
 def ask_peers(out: Path, jobs: int, every: int) -> None:
     """Write what two peers say: sparse regression of every recording, stepwise BIC of one in `every`: it is slow."""
-    model = load(MODEL)
+    model = load(folder.MODEL)
 
     def one(_: int, row: tuple[str, str]) -> tuple[str, str, dict[str, Any]]:
         peer, name = row
@@ -103,17 +71,17 @@ def ask_peers(out: Path, jobs: int, every: int) -> None:
         answer = peers.sparse_regression if peer == SPARSE else peers.stepwise_bic
         return peer, name, answer(signals, model)
 
-    names = sorted(p.name for p in (out / "recordings").iterdir())
+    names = folder.names(out)
     rows = [(SPARSE, n) for n in names] + [(BIC, n) for n in names[::every]]
     answers: dict[str, dict[str, Any]] = {SPARSE: {}, BIC: {}}
-    for peer, name, answer in _shown("asking peers", rows, one, jobs):
+    for peer, name, answer in folder.each("asking peers", rows, one, jobs):
         answers[peer][name] = answer
     (out / "peers.json").write_text(json.dumps(answers))
 
 
 def limits(out: Path, labels: list[dict[str, Any]], jobs: int) -> dict[str, Any]:
     """What a likelihood test that knows both hypotheses would reach, for the single effects of the table's form."""
-    model = load(MODEL)
+    model = load(folder.MODEL)
 
     def one(_: int, label: dict[str, Any]) -> tuple[str, dict[str, Any]]:
         signals = from_recording(recording.read(str(out / "recordings" / label["name"])), model.sensing)
@@ -123,49 +91,21 @@ def limits(out: Path, labels: list[dict[str, Any]], jobs: int) -> dict[str, Any]
 
     rows = [c for c in labels if c["kind"] == "single" and c["form"] == "table" and not c["closed_loop"]
             and c["effects"][0]["effect"] not in limit.RANDOM]
-    return dict(_shown("finding the limit", rows, one, jobs))
+    return dict(folder.each("finding the limit", rows, one, jobs))
 
 
-def _shown(what: str, rows: list[Any], one: Any, jobs: int) -> list[Any]:
-    """Run one(k, row) for each row on `jobs` processes, with a bar."""
-    with Progress() as bar:
-        return list(bar.track(Parallel(jobs, return_as="generator")(delayed(one)(k, r) for k, r in enumerate(rows)),
-                              len(rows), description=what))
-
-
-def opened(out: Path) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
-    """Labels and verdicts.
-
-    Raises:
-        SystemExit: a verdict is missing; the labels stay sealed until all are written.
-    """
-    names = sorted(p.name for p in (out / "recordings").iterdir())
-    missing = [n for n in names if not (out / "verdicts" / f"{n}.json").exists()]
-    if missing:
-        raise SystemExit(f"{len(missing)} of {len(names)} verdicts are missing ({missing[0]} ...): diagnose first")
-    verdicts = {n: json.loads((out / "verdicts" / f"{n}.json").read_text()) for n in names}
-    return json.loads(zlib.decompress((out / SEALED).read_bytes())), verdicts
-
-
-def _uncalibrated_rigs(options: argparse.Namespace, steps: list[str]) -> None:
-    out = options.out / "unknown"
+def _other_rigs(options: argparse.Namespace, steps: list[str]) -> None:
+    name, make_all, report_, fit_nominal = (
+        ("circumstances", circumstances.make_all, circumstances.report, False) if options.circumstances else
+        ("unknown", uncalibrated.make, uncalibrated.report, True))
+    out = options.out / name
     if "make" in steps:
         shutil.rmtree(out, ignore_errors=True)
-        uncalibrated.make(out, options.count, options.seed, options.duration, options.jobs)
+        make_all(out, options.count, options.seed, options.duration, options.jobs)
     if "diagnose" in steps:
-        uncalibrated.diagnose_all(out, options.jobs)
+        folder.diagnose_all(out, options.jobs, fit_nominal=fit_nominal)
     if "score" in steps:
-        _save(out, uncalibrated.report(out), options)
-
-
-def _circumstances(options: argparse.Namespace, steps: list[str]) -> None:
-    out = options.out / "circumstances"
-    if "make" in steps:
-        circumstances.make_all(out, options.count, options.seed, options.duration, options.jobs)
-    if "diagnose" in steps:
-        circumstances.diagnose_all(out, options.jobs)
-    if "score" in steps:
-        _save(out, circumstances.report(out), options)
+        _save(out, report_(out), options)
 
 
 def _save(out: Path, found: list[score.Figure], options: argparse.Namespace) -> None:
@@ -193,25 +133,22 @@ def main() -> None:
     options = parser.parse_args()
     steps = options.steps.split(",")
     if options.docs:
-        folder, name = (("unknown", "uncalibrated") if options.uncalibrated else
-                        ("circumstances", "circumstances") if options.circumstances else ("", "blind"))
-        page.write(options.out / folder, name)
+        part, name = (("unknown", "uncalibrated") if options.uncalibrated else
+                      ("circumstances", "circumstances") if options.circumstances else ("", "blind"))
+        page.write(options.out / part, name)
         return
-    if options.circumstances:
-        _circumstances(options, steps)
-        return
-    if options.uncalibrated:
-        _uncalibrated_rigs(options, steps)
+    if options.circumstances or options.uncalibrated:
+        _other_rigs(options, steps)
         return
     if "make" in steps:
         shutil.rmtree(options.out, ignore_errors=True)
         make(options.out, options.count, options.seed, options.duration, options.jobs)
     if "diagnose" in steps:
-        diagnose_all(options.out, options.jobs, options.only)
+        folder.diagnose_all(options.out, options.jobs, options.only)
     if "peers" in steps:
         ask_peers(options.out, options.jobs, options.bic_every)
     if "score" in steps:
-        labels, verdicts = opened(options.out)
+        labels, verdicts = folder.opened(options.out)
         asked = options.out / "peers.json"
         answers = json.loads(asked.read_text()) if asked.exists() else {}
         known = limits(options.out, labels, options.jobs) if answers else None

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,9 @@ OWN_SIZES = {"thrust_lag": 0.08, "encoder_lag": 0.03, "axial_inflow": 1e-4, "qua
              "ground_effect": 0.25, "current_gain": 0.3, "speed_spikes": 2.0}
 MOST = {"current_gain": 2.0, "thrust_exponent": 4.0, "mast_flex": 2.5, "bridge_drop": 5.0, "quadratic_drag": 20.0}
 """How far above its start a size may go and still be a rig that somebody might have; 30 times otherwise."""
+
+SIGNED = ("angle_offset", "current_offset", "voltage_offset", "current_gain", "thrust_exponent")
+"""Effects whose size is as often negative as positive (choice)."""
 
 
 @dataclass(frozen=True)
@@ -194,6 +198,54 @@ def others(id_: str, rng: np.random.Generator) -> dict[str, float]:
     }.get(id_, dict)()
 
 
+def scale(id_: str) -> tuple[str, float, float]:
+    """The parameter that holds the size of an effect, where its search starts, and its value without the effect."""
+    if id_ in OUTSIDE:
+        return "size", OUTSIDE[id_][1], 0.0
+    head = EFFECTS[id_][0]
+    return head, OWN_SIZES.get(id_, SIZES.get(head, 1.0)), 2.0 if head == "n" else 0.0
+
+
+def parameters_of(id_: str, rng: np.random.Generator) -> Callable[[float], dict[str, float]]:
+    """The parameters of an effect as a function of its size; those besides the size, and the sign, are drawn."""
+    head, _, neutral = scale(id_)
+    rest = others(id_, rng)
+    sign = float(rng.choice([-1.0, 1.0])) if id_ in SIGNED else 1.0
+    return lambda size: {head: neutral + sign * size, **rest}
+
+
+def gusts_of(entry: Mapping[str, Any], samples: int, *, other: bool) -> Array:
+    """Random torque (samples + 2,) of an effect that was drawn with its seed "draw"; (0,) if it is no gust."""
+    if entry["effect"] != "gust":
+        return np.zeros(0)
+    own = entry["parameters"]
+    return plant.turbulence(own["sigma"], own["tau"], samples, other, np.random.default_rng(entry["draw"]))
+
+
+def search(id_: str, sizer: Sizer, goal: float, of_size: Callable[[float], dict[str, float]], draw: int, *,
+           other: bool, most: float) -> tuple[dict[str, Any], float]:
+    """An effect at the size that leaves `goal` floors; and its size in floors.
+
+    Args:
+        id_: of an effect of the catalogue.
+        sizer: of the rig.
+        goal: floors.
+        of_size: parameters as a function of the size.
+        draw: seed of the effect's chance.
+        other: whether the effect has the other form.
+        most: largest size, in sizes that the search starts from.
+    """
+    def entry(size: float) -> dict[str, Any]:
+        return {"effect": id_, "place": PLACES[id_], "parameters": of_size(size), "draw": draw}
+
+    def make(size: float) -> tuple[Array, Array]:
+        return (sizer.packed({id_: of_size(size)}, {}, other=other),
+                gusts_of(entry(size), len(sizer.duty), other=other))
+
+    size, left = sizer.size(make, abs(scale(id_)[1]), goal, most)
+    return entry(size), left
+
+
 def sized(id_: str, sizer: Sizer, goal: float, form: str, nominal: Mapping[str, float],
           rng: np.random.Generator) -> tuple[dict[str, object], float]:
     """An effect with its parameters, drawn, sized to leave `goal` floors; and its size in floors."""
@@ -210,12 +262,7 @@ def sized(id_: str, sizer: Sizer, goal: float, form: str, nominal: Mapping[str, 
         name = str(rng.choice(list(MISMATCHES)))
         value = nominal[name] * (1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(0.15, 0.4))
         return {"effect": id_, "place": MISMATCHES[name], "parameters": {name: value}}, 0.0
-    head, rest = EFFECTS[id_][0], others(id_, rng)
-    start = OWN_SIZES.get(id_, SIZES.get(head, 1.0))
-    sign = -1.0 if start < 0.0 else 1.0
-    if id_ in ("angle_offset", "current_offset", "voltage_offset", "current_gain", "thrust_exponent", "supply_drift"):
-        sign = float(rng.choice([-1.0, 1.0])) if id_ != "supply_drift" else 1.0
-    neutral = 2.0 if head == "n" else 0.0
+    of_size = parameters_of(id_, rng)
     shape = np.random.default_rng(int(rng.integers(2**31)))
     draw = int(shape.integers(2**31))
     if id_ == "command_delay":  # the least delay shows in full where a step is sampled: not a matter of floors
@@ -225,15 +272,7 @@ def sized(id_: str, sizer: Sizer, goal: float, form: str, nominal: Mapping[str, 
         rate = math.exp(rng.uniform(*np.log((0.2, 4.0))))
         return {"effect": id_, "place": "sensing", "parameters": {"rate": rate}, "draw": draw}, 0.0
 
-    def make(s: float) -> tuple[Array, Array]:
-        own = {head: neutral + sign * s, **rest}
-        gusts = (plant.turbulence(s, rest["tau"], len(sizer.duty), other, np.random.default_rng(draw))
-                 if id_ == "gust" else np.zeros(0))
-        return sizer.packed({id_: own}, {}, other=other), gusts
-
-    size, left = sizer.size(make, abs(start), goal, MOST.get(id_, 30.0))
-    entry = {"effect": id_, "place": PLACES[id_], "parameters": {head: neutral + sign * size, **rest}, "draw": draw}
-    return entry, left
+    return search(id_, sizer, goal, of_size, draw, other=other, most=MOST.get(id_, 30.0))
 
 
 def draw(name: str, kind: str, effects: list[str], form: str, nominal: Mapping[str, float],
@@ -264,8 +303,7 @@ def draw(name: str, kind: str, effects: list[str], form: str, nominal: Mapping[s
     gusts = np.zeros(0)
     for e in drawn:
         if e["effect"] == "gust":
-            gusts = plant.turbulence(inside["gust"]["sigma"], inside["gust"]["tau"], len(duty),  # type: ignore[index]
-                                     form == "other", np.random.default_rng(e.pop("draw")))  # type: ignore[arg-type]
+            gusts = gusts_of(e, len(duty), other=form == "other")
         e.pop("draw", None)
     y, v, applied = plant.states(p, duty, gusts, pid(rng) if closed_loop else None)
     columns = plant.measured(p, y, v, sensing, rng)

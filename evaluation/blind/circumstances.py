@@ -7,35 +7,22 @@ an effect in the gap is that of the mean square which no refit of the numbers ab
 
 from __future__ import annotations
 
-import json
 import math
-import shutil
-import time
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-from aeropend_ident.diagnosis.diagnosis import diagnose
-from aeropend_ident.diagnosis.document import to_json
-from aeropend_ident.diagnosis.results import document
-from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.testing import bags
-from aeropend_sim.errors import UserError
 from aeropend_sim.model.parameters import load
-from evaluation.blind import cases, plant, score
+from evaluation.blind import cases, folder, page, plant, score
 from evaluation.blind.plant import EFFECTS, OUTSIDE, PERIOD
 
 Array = NDArray[np.float64]
-
-MODEL = "bench"
-SEALED = "labels.sealed"
 
 ROWS = {"messy": 0.4, "closed loop": 0.2, "nothing missing": 0.25, "three effects": 0.15}
 """Circumstance -> share of the recordings."""
@@ -99,8 +86,7 @@ class Drawn:
     def scaled(self, rig: Weighed, factor: float, most: float = LARGEST) -> Drawn:
         """The effect at another size, at most one that a rig might have."""
         own = dict(self.parameters)
-        head, start = _size(self.effect)
-        neutral = 2.0 if head == "n" else 0.0
+        head, start, neutral = cases.scale(self.effect)
         factor = min(factor, most * abs(start) / max(abs(own[head] - neutral), 1e-12))
         own[head] = neutral + factor * (own[head] - neutral)
         gusts = factor * self.gusts
@@ -113,22 +99,9 @@ def _packed(rig: Weighed, effects: Sequence[tuple[str, Mapping[str, float]]]) ->
     return rig.packed(inside, outside, other=True)
 
 
-def _size(effect: str) -> tuple[str, float]:
-    """Name of the size of an effect, and where the search for a size starts."""
-    if effect in OUTSIDE:
-        return "size", OUTSIDE[effect][1]
-    head = EFFECTS[effect][0]
-    return head, cases.OWN_SIZES.get(effect, cases.SIZES.get(head, 1.0))
-
-
 def small(effect: str, rig: Weighed, rng: np.random.Generator) -> Drawn:
     """An imperfection of a messy rig: an effect in another form than the catalogue's, at a size of about a floor."""
-    rest = cases.others(effect, rng) if effect in EFFECTS else {}
-    head, start = _size(effect)
-    neutral = 2.0 if head == "n" else 0.0
-    sign = float(rng.choice([-1.0, 1.0])) if effect in {"angle_offset", "current_offset", "voltage_offset",
-                                                       "current_gain", "thrust_exponent"} else 1.0
-    own = {head: neutral + 0.1 * sign * start, **rest}
+    own = cases.parameters_of(effect, rng)(0.1 * cases.scale(effect)[1])
     gusts = np.zeros(0)
     if effect == "gust":
         gusts = plant.turbulence(own["sigma"], own["tau"], len(rig.duty), True, rng)
@@ -259,7 +232,6 @@ def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing
             assert rig is not None
             goal = math.exp(rng.uniform(*np.log(cases.FLOORS)))
             entry, _ = cases.sized(effect, rig, goal, "other" if other else "table", nominal, rng)
-            draw = entry.pop("draw", 0)
             label["effects"].append(entry)
             parameters: dict[str, float] = entry["parameters"]  # type: ignore[assignment]
             if effect == "parameter_mismatch":
@@ -267,8 +239,8 @@ def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing
             else:
                 inside[effect] = parameters
             if effect == "gust":
-                gusts = plant.turbulence(parameters["sigma"], parameters["tau"], len(duty), other,
-                                         np.random.default_rng(draw))  # type: ignore[arg-type]
+                gusts = cases.gusts_of(entry, len(duty), other=other)
+            entry.pop("draw", None)
         p = plant.packed(numbers, own["angle_filter_tau"], inside, {}, other)
     y, v, applied = plant.states(p, duty, gusts, controller)
     return label, {**plant.measured(p, y, v, own, rng), "duty": applied}, lost
@@ -296,34 +268,14 @@ def plan(count: int, seed: int) -> list[tuple[str, list[str]]]:
 
 def make_all(out: Path, count: int, seed: int, duration: float, jobs: int) -> None:
     """Make the recordings, and seal their labels."""
-    nominal = load(MODEL)
+    nominal = load(folder.MODEL)
 
     def one(k: int, row: tuple[str, list[str]]) -> dict[str, Any]:
         label, columns, lost = make(*row, nominal.model, nominal.sensing, seed * 100_019 + k, duration)
         bags.write(out / "recordings" / f"c{k:03d}", columns, round(PERIOD * 1e9), lost)
         return {"name": f"c{k:03d}", **label}
 
-    shutil.rmtree(out, ignore_errors=True)
-    (out / "recordings").mkdir(parents=True)
-    labels = Parallel(jobs)(delayed(one)(k, row) for k, row in enumerate(plan(count, seed)))
-    (out / SEALED).write_bytes(zlib.compress(json.dumps(labels).encode()))
-
-
-def diagnose_all(out: Path, jobs: int) -> None:
-    """Write a verdict for each recording; the labels stay sealed."""
-    model = load(MODEL)
-    (out / "verdicts").mkdir(exist_ok=True)
-
-    def one(path: Path) -> None:
-        started = time.perf_counter()
-        try:
-            result = diagnose(model, [signals_of(path, None, model.sensing)], 1)
-            body = to_json(document(result, [path.name], MODEL, time.perf_counter() - started))
-        except UserError as error:
-            body = {"error": str(error), "seconds": time.perf_counter() - started}
-        (out / "verdicts" / f"{path.name}.json").write_text(json.dumps(body))
-
-    Parallel(jobs)(delayed(one)(path) for path in sorted((out / "recordings").iterdir()))
+    folder.make_all(out, plan(count, seed), one, jobs)
 
 
 @dataclass(frozen=True)
@@ -385,13 +337,10 @@ def judged(out: Path) -> list[Judged]:
     Raises:
         SystemExit: a verdict is missing; the labels stay sealed until all are written.
     """
-    names = sorted(p.name for p in (out / "recordings").iterdir())
-    missing = [n for n in names if not (out / "verdicts" / f"{n}.json").exists()]
-    if missing:
-        raise SystemExit(f"{len(missing)} of {len(names)} verdicts are missing ({missing[0]} ...): diagnose first")
+    labels, verdicts = folder.opened(out)
     found = []
-    for label in json.loads(zlib.decompress((out / SEALED).read_bytes())):
-        body = json.loads((out / "verdicts" / f"{label['name']}.json").read_text())
+    for label in labels:
+        body = verdicts[label["name"]]
         shares = {c["effect"]: (c["share"]["value"], c["share"]["low"], c["share"]["high"])
                   for c in body.get("which", {}).get("candidates", ()) if c.get("share")}
         found.append(Judged(label, score.answer_of_diagnosis(body), shares))
@@ -437,5 +386,5 @@ def report(out: Path) -> list[score.Figure]:
               f"{', '.join(said)}; {j.answer.seconds:.1f} s")
     made = figures(found)
     for f in made:
-        print(f.line())
+        print(page.line(f.document()))
     return made

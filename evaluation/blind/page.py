@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tables of docs/results/blind.md and uncalibrated.md, from the results of a blind check."""
+"""The figures of a blind check as text: lines, and the tables of docs/results."""
 
 from __future__ import annotations
 
@@ -45,6 +45,15 @@ def target(figure: Figure) -> str:
     if low is not None:
         return f"at least {scale * low:g}{unit}"
     return f"at most {scale * high:g}{unit}" if high is not None else ""
+
+
+def line(figure: Figure) -> str:
+    """A figure as a line of text: value, 95 % interval, count, target, and whether it is met."""
+    if figure["value"] is None:
+        return f"{figure['name']}: nothing to measure"
+    between = f" (95 %: {interval(figure)})" if interval(figure) else ""
+    goal = f", {target(figure)}: {'met' if figure['met'] else 'MISSED'}" if target(figure) else ""
+    return f"{figure['name']}: {value(figure)}{between} of {figure['count']}{goal}"
 
 
 def table(document: results.Document) -> str:

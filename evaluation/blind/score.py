@@ -197,16 +197,6 @@ class Figure:
         return (self.value is not None and (self.at_least is None or self.value >= self.at_least)
                 and (self.at_most is None or self.value <= self.at_most))
 
-    def line(self) -> str:
-        """The figure as a line of text."""
-        if self.value is None:
-            return f"{self.name}: nothing to measure"
-        scale, unit = (100.0, " %") if self.share else (1.0, "")
-        target = (f", at least {scale * self.at_least:g}{unit}" if self.at_least is not None else
-                  f", at most {scale * self.at_most:g}{unit}" if self.at_most is not None else "")
-        met = {True: ": met", False: ": MISSED"}[self.met] if self.judged else ""
-        return f"{self.name}: {scale * self.value:.3g}{unit} of {self.count}{target}{met}"
-
     def document(self) -> dict[str, Any]:
         """The figure as JSON; "met" is null without a target."""
         return asdict(self) | {"met": self.met if self.judged else None}

@@ -7,34 +7,22 @@ the angle has a resolution of up to a degree. The size of an effect counts what 
 
 from __future__ import annotations
 
-import json
 import math
-import time
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from scipy.integrate import odeint
 from scipy.optimize import lsq_linear
 
-from aeropend_ident.bags.recording import RecordingError
-from aeropend_ident.diagnosis.diagnosis import diagnose
-from aeropend_ident.diagnosis.document import to_json
-from aeropend_ident.diagnosis.results import document
-from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.testing import bags
 from aeropend_sim.model.parameters import load
-from evaluation.blind import cases, plant, score
+from evaluation.blind import cases, folder, page, plant, score
 from evaluation.blind.plant import NUMBERS, PERIOD, S
 
 Array = NDArray[np.float64]
-
-MODEL = "bench"
-SEALED = "labels.sealed"
 
 FACTOR = 3.0
 """Largest over smallest value of a number among the rigs."""
@@ -113,7 +101,8 @@ def driven(name: str, effect: str, form: str, nominal: Mapping[str, float], tau:
             entry, size = _sized(effect, sizer, goal, other, rng)
             if not 0.7 * cases.FLOORS[0] < size < 1.4 * cases.FLOORS[1]:
                 continue  # this rig cannot show it at a size that a rig might have
-            effects, gusts = [entry], entry.pop("gusts")
+            effects, gusts = [entry], cases.gusts_of(entry, len(duty), other=other)
+            del entry["draw"]
         inside = {e["effect"]: e["parameters"] for e in effects}
         p = plant.packed(numbers, tau, inside, {}, other)
         y, v, _ = plant.states(p, duty, gusts)
@@ -130,22 +119,9 @@ def driven(name: str, effect: str, form: str, nominal: Mapping[str, float], tau:
 
 def _sized(effect: str, sizer: AngleSizer, goal: float, other: bool, rng: np.random.Generator
            ) -> tuple[dict[str, Any], float]:
-    head, rest = plant.EFFECTS[effect][0], cases.others(effect, rng)
-    start = cases.OWN_SIZES.get(effect, cases.SIZES.get(head, 1.0))
-    sign = -1.0 if start < 0.0 else 1.0
-    if effect in ("angle_offset", "thrust_exponent"):
-        sign = float(rng.choice([-1.0, 1.0]))
-    neutral = 2.0 if head == "n" else 0.0
+    of_size = cases.parameters_of(effect, rng)
     draw = int(rng.integers(2**31))
-
-    def make(s: float) -> tuple[Array, Array]:
-        gusts = (plant.turbulence(s, rest["tau"], len(sizer.duty), other, np.random.default_rng(draw))
-                 if effect == "gust" else np.zeros(0))
-        return sizer.packed({effect: {head: neutral + sign * s, **rest}}, {}, other=other), gusts
-
-    size, left = sizer.size(make, abs(start), goal, cases.MOST.get(effect, 10.0))
-    return {"effect": effect, "place": cases.PLACES[effect], "parameters": {head: neutral + sign * size, **rest},
-            "gusts": make(size)[1]}, left
+    return cases.search(effect, sizer, goal, of_size, draw, other=other, most=cases.MOST.get(effect, 10.0))
 
 
 def decay(name: str, damping: str, nominal: Mapping[str, float], seed: int, rate: float = 20.0,
@@ -193,7 +169,7 @@ def plan(count: int, seed: int) -> list[tuple[str, str, str]]:
 
 def make(out: Path, count: int, seed: int, duration: float, jobs: int) -> None:
     """Make the recordings, and seal their labels."""
-    nominal = load(MODEL)
+    nominal = load(folder.MODEL)
 
     def one(k: int, row: tuple[str, str, str]) -> dict[str, Any]:
         what, effect, form = row
@@ -206,27 +182,7 @@ def make(out: Path, count: int, seed: int, duration: float, jobs: int) -> None:
         bags.write(out / "recordings" / name, columns, round(period * 1e9))
         return {**label, "what": what}
 
-    (out / "recordings").mkdir(parents=True)
-    labels = Parallel(jobs)(delayed(one)(k, row) for k, row in enumerate(plan(count, seed)))
-    (out / SEALED).write_bytes(zlib.compress(json.dumps(labels).encode()))
-
-
-def diagnose_all(out: Path, jobs: int) -> None:
-    """Write a verdict for each recording, as `diagnose --fit-nominal` gives it; the labels stay sealed."""
-    model = load(MODEL)
-    (out / "verdicts").mkdir(exist_ok=True)
-
-    def one(name: str) -> None:
-        started = time.perf_counter()
-        try:
-            signals = signals_of(out / "recordings" / name, None, model.sensing, fit_nominal=True)
-            result = diagnose(model, [signals], 1, fit_nominal=True)
-            body = to_json(document(result, [name], MODEL, time.perf_counter() - started))
-        except RecordingError as error:
-            body = {"error": str(error), "seconds": time.perf_counter() - started}
-        (out / "verdicts" / f"{name}.json").write_text(json.dumps(body))
-
-    Parallel(jobs)(delayed(one)(p.name) for p in sorted((out / "recordings").iterdir()))
+    folder.make_all(out, plan(count, seed), one, jobs)
 
 
 def left(body: Mapping[str, Any] | None) -> float:
@@ -268,15 +224,7 @@ def report(out: Path) -> list[score.Figure]:
     Raises:
         SystemExit: a verdict is missing.
     """
-    missing = [p.name for p in sorted((out / "recordings").iterdir())
-               if not (out / "verdicts" / f"{p.name}.json").exists()]
-    if missing:
-        raise SystemExit(f"{len(missing)} verdicts are missing ({missing[0]} ...): diagnose first")
-    labels = json.loads(zlib.decompress((out / SEALED).read_bytes()))
-    verdicts = {v.stem: json.loads(v.read_text()) for v in (out / "verdicts").iterdir()}
-    found = figures(labels, verdicts)
+    found = figures(*folder.opened(out))
     for f in found:
-        target = f"  (at least {f.at_least:g})" if f.at_least else f"  (at most {f.at_most:g})" if f.at_most else ""
-        between = f"  {f.low:.2f} to {f.high:.2f}" if f.low is not None else ""
-        print(f"{f.name}: {'-' if f.value is None else f'{f.value:.3f}'}{between}  of {f.count}{target}")
+        print(page.line(f.document()))
     return found

@@ -6,7 +6,7 @@ import zlib
 import numpy as np
 import pytest
 from evaluation.blind import __main__ as check
-from evaluation.blind import cases, plant, score
+from evaluation.blind import cases, folder, plant, score
 
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.signals.signals import from_arrays
@@ -23,11 +23,11 @@ def checked(tmp_path_factory):
     """Labels and verdicts; the labels are in another folder while verdicts are made."""
     out = tmp_path_factory.mktemp("blind")
     check.make(out / "made", COUNT, SEED, DURATION, PROCESSES)
-    sealed = out / "made" / check.SEALED
+    sealed = out / "made" / folder.SEALED
     sealed.rename(out / "elsewhere")
-    check.diagnose_all(out / "made", PROCESSES, [])
+    folder.diagnose_all(out / "made", PROCESSES)
     (out / "elsewhere").rename(sealed)
-    return out / "made", *check.opened(out / "made")
+    return out / "made", *folder.opened(out / "made")
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_what_is_outside_the_catalogue_is_placed_and_not_always_claimed(pairs):
 @pytest.mark.promise("Measurements", "The blind check opens the labels after the last verdict")
 def test_labels_open_only_after_the_last_verdict(checked):
     out, labels, _ = checked
-    content = (out / check.SEALED).read_bytes()
+    content = (out / folder.SEALED).read_bytes()
     effects = [e["effect"] for label in labels for e in label["effects"]]
     assert len(effects) > 15
     assert not any(effect.encode() in content for effect in effects)
@@ -72,7 +72,7 @@ def test_labels_open_only_after_the_last_verdict(checked):
     last = sorted((out / "verdicts").iterdir())[-1]
     last.rename(out / "away")
     with pytest.raises(SystemExit, match=f"^1 of {len(labels)} verdicts are missing .*{last.stem}"):
-        check.opened(out)
+        folder.opened(out)
     (out / "away").rename(last)
 
 

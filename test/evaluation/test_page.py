@@ -39,6 +39,13 @@ def test_the_page_has_each_figure_with_its_target_and_the_conditions(tree):
     assert "Measured on 2026-01-02: 12 recordings, seed 5, commit abc, a CPU, 2 cores, Python 3.12.1. BIC was" in text
 
 
+def test_a_line_tells_the_figure_with_its_interval_and_its_target():
+    lines = [page.line(f.document()) for f in [*FIGURES, score.share("nothing", [], at_least=0.5)]]
+    assert lines == ["right effect first: 90.0 % (95 %: 59.6 to 98.2) of 10, at least 75 %: met",
+                     "claimed: 50.0 % (95 %: 9.5 to 90.5) of 2, at most 3 %: MISSED",
+                     "seconds | median: 4.6 of 12", "nothing: nothing to measure"]
+
+
 def test_without_a_run_or_a_place_for_the_table_there_is_one_line(tree):
     with pytest.raises(SystemExit, match=r"^blind: .*none/results.json does not exist: run make blind first$"):
         page.write(tree / "none", "blind")

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from evaluation.blind import score, uncalibrated
+from evaluation.blind import folder, score, uncalibrated
 
 from aeropend_sim.model.parameters import load
 
@@ -20,9 +20,9 @@ def checked(tmp_path_factory):
     """Labels and verdicts; the labels are elsewhere while verdicts are made."""
     out = tmp_path_factory.mktemp("unknown") / "made"
     uncalibrated.make(out, COUNT, SEED, DURATION, 2)
-    sealed = out / uncalibrated.SEALED
+    sealed = out / folder.SEALED
     sealed.rename(out.parent / "elsewhere")
-    uncalibrated.diagnose_all(out, 2)
+    folder.diagnose_all(out, 2, fit_nominal=True)
     (out.parent / "elsewhere").rename(sealed)
     return out
 
@@ -47,7 +47,7 @@ def test_every_recording_got_a_verdict(checked):
 def test_labels_open_only_after_the_last_verdict(checked):
     last = sorted((checked / "verdicts").iterdir())[-1]
     last.rename(checked / "away")
-    with pytest.raises(SystemExit, match=f"^1 verdicts are missing .{last.stem}"):
+    with pytest.raises(SystemExit, match=f"^1 of {COUNT} verdicts are missing .{last.stem}"):
         uncalibrated.report(checked)
     (checked / "away").rename(last)
 
@@ -61,7 +61,7 @@ def test_every_kind_of_recording_is_planned():
 
 
 def test_rigs_differ_by_a_factor_of_three_and_lift_their_arm():
-    nominal = load(uncalibrated.MODEL).model
+    nominal = load(folder.MODEL).model
     rigs = [uncalibrated.rig(nominal, np.random.default_rng(seed))[0] for seed in range(60)]
     ratio = np.array([n["c_over_J"] / nominal["c_over_J"] for n in rigs])
     assert ratio.max() / ratio.min() == pytest.approx(3.0, rel=0.15)
@@ -69,7 +69,7 @@ def test_rigs_differ_by_a_factor_of_three_and_lift_their_arm():
 
 @pytest.mark.parametrize("damping", uncalibrated.DAMPING)
 def test_a_free_decay_keeps_the_amplitude_that_it_was_drawn_with(damping):
-    label, columns, period = uncalibrated.decay("x", damping, load(uncalibrated.MODEL).model, 5, rate=200.0, lsb=0.0)
+    label, columns, period = uncalibrated.decay("x", damping, load(folder.MODEL).model, 5, rate=200.0, lsb=0.0)
     theta = columns["theta"]
     gravity = label["numbers"]["mgd_over_J"]
     swings = 10.0 * math.pi / math.sqrt(gravity)
