@@ -49,8 +49,10 @@ NEAR = 0.05
 """[s] Distance of an instant from its estimate within which the search is not made again (choice: a tenth of what
 counts as found)."""
 
-FINER = 5
-"""Ratio of the distances of two passes that move the instant (choice)."""
+WIDE, PIECES = 2.0, 16
+"""[s] Distance over which the instant is moved at first, and into how many pieces it is divided on each side (choice).
+
+An arm that swings gives a minimum of the misfit in each swing."""
 
 WITHIN = 1.92
 """Log likelihood below its maximum at the ends of a 95 % interval (derived: half the 95 % quantile of χ² of one)."""
@@ -160,16 +162,18 @@ def _located(chain: CutChain, fits: Mapping[str, Fit]) -> tuple[Window, list[int
         return sum(0.5 * f.ess[channel] * float(np.mean(r * r)) / f.scale[channel] ** 2
                    for b, f in fits.items() for channel, r in moved.residuals(b)(f.values).items())
 
-    best = window[not begins]
-    step, costs = max(round(GRID / chain.signals.period / 2), 1), dict[int, float]()
+    first, last = 1, len(chain.signals) - 1
+    best, reach, costs = window[not begins], round(WIDE / chain.signals.period), dict[int, float]()
     while True:
-        near = [k for k in range(best - 4 * step, best + 4 * step + 1, step) if 0 < k < len(chain.signals)]
+        step = max(reach // PIECES, 1)
+        near = range(max(best - reach, first), min(best + reach, last) + 1, step)
         costs.update({k: cost(k) for k in near if k not in costs})
         best = min(costs, key=lambda k: costs[k])
-        if step == 1 and near[0] < best < near[-1]:
+        if not (near[0] < best < near[-1] or best - step < first or best + step > last):
+            continue  # it may lie beyond what was tried
+        if step == 1:
             break
-        if near[0] < best < near[-1]:
-            step = max(step // FINER, 1)
+        reach = 2 * step
     return _moved(window, best, begins=begins), [k for k, c in costs.items() if c < costs[best] + WITHIN]
 
 

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Effects that begin or end during a recording are found with their instant."""
+
+import numpy as np
+import pytest
+
+from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.results import document, verdict_lines
+from aeropend_ident.testing.rigs import BENCH, changing, recorded
+
+
+@pytest.mark.promise("Verdict", "An effect that begins or ends during the recording is found with its instant")
+@pytest.mark.parametrize(("effect", "since", "until"), [
+    ("coulomb_friction", 14.3, np.inf), ("supply_sag", 0.0, 17.2), ("encoder_eccentricity", 20.1, np.inf),
+    ("rotor_friction", 0.0, 11.7)])
+def test_when_an_effect_begins_or_ends(effect, since, until):
+    found = diagnose(BENCH, [changing(31, {effect: {}}, since, until)], 2).conclusions.which
+    assert found.effects == (effect,)
+    (one,) = (c for c in found.candidates if c.found)
+    (at, true), none = ((one.since, since), one.until) if since else ((one.until, until), one.since)
+    assert none is None
+    assert at.low <= at.value <= at.high
+    assert abs(at.value - true) < 0.5
+
+
+def test_an_effect_that_acts_all_the_time_has_no_instant():
+    found = diagnose(BENCH, [recorded(31, {"coulomb_friction": {}})], 2).conclusions.which
+    assert found.effects == ("coulomb_friction",)
+    assert all(c.since is None and c.until is None for c in found.candidates)
+
+
+@pytest.mark.promise("Verdict", "A change in the last part of a recording is judged too")
+def test_a_change_in_the_part_that_is_held_out_at_first():
+    signals = changing(32, {"coulomb_friction": {}}, since=29.5)
+    made = diagnose(BENCH, [signals], 2)
+    text = "\n".join(verdict_lines(document(made, ["bag"], "bench", 0.0)))
+    assert made.conclusions.which.effects == ("coulomb_friction",)
+    assert "begins at 29." in text
+    assert any("only the rest is held out" in note for s in made.signals for note in s.notes)
