@@ -7,6 +7,7 @@ import pytest
 from aeropend_ident.diagnosis import gap_share
 from aeropend_ident.diagnosis.free_run_gap import Gap
 from aeropend_ident.diagnosis.gap_share import UNKNOWN, Part, headline, shares, unexplained
+from aeropend_ident.diagnosis.search.free_curves import Repeatable
 
 
 def part(name, amount, place="arm", unsure=0.0, windows=10):
@@ -42,7 +43,7 @@ def test_false_captures_do_not_count_in_the_shares_of_others():
     ([part("gust", 2.0), part(UNKNOWN, 1.0, "thrust")], "gust", ["gust"], []),
     ([part("gust", 1.0), part(UNKNOWN, 2.0, "thrust")], "unknown", ["gust"], []),
     ([part("gust", 0.6), part("brush_drop", 0.6), part(UNKNOWN, 1.3, "thrust")], "unknown", ["gust", "brush_drop"], []),
-    ([part(UNKNOWN, 0.0, "thrust")], "unknown", [], []),
+    ([part(UNKNOWN, 0.0, "thrust")], "none", [], []),
 ])
 def test_the_verdict_is_the_largest_part(parts, verdict, effects, small):
     head = headline(parts, shares(parts), 0.03)
@@ -63,5 +64,6 @@ def test_what_is_left_above_the_floor_lies_where_its_channel_shows_it_or_at_the_
     (arm,) = unexplained(after, floors, None, None)
     assert (arm.name, arm.place, arm.amount) == ("", "arm", pytest.approx(0.015))
     np.testing.assert_allclose(arm.windows, 0.015)
-    (unknown,) = unexplained(after, floors, None, "thrust")
-    assert (unknown.name, unknown.place, unknown.amount) == (UNKNOWN, "thrust", pytest.approx(0.015))
+    arm, unknown = unexplained(after, floors, None, Repeatable("thrust", 0.75))
+    assert (arm.name, arm.place, arm.amount) == ("", "arm", pytest.approx(0.25 * 0.015))
+    assert (unknown.name, unknown.place, unknown.amount) == (UNKNOWN, "thrust", pytest.approx(0.75 * 0.015))

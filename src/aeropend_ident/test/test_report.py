@@ -243,7 +243,8 @@ def test_what_an_unknown_looks_like(strange):
     names = [t for t in page.text("figure", "p").split("torque on the arm") if t]
     assert names[0].strip().startswith(", as acceleration, rad/s² against the arm rate")
     captions = page.text("figcaption")
-    assert captions.startswith("Peaks at")
+    assert captions.startswith("What could be closed of the squared gap: ")
+    assert "Peaks at" in captions
     assert captions.count(".") >= len(drawn)
 
 
@@ -419,7 +420,7 @@ def test_a_short_free_decay_is_drawn_without_what_it_lacks(angle_only):
 
 def test_several_recordings_are_told_apart(two):
     page = Page(rendered(two, ["monday", "tuesday"]))
-    assert page.text("figcaption") == "mondaytuesday"
+    assert page.text("figcaption").endswith("mondaytuesday")
     assert len(page.data()) == 2
     assert "the last part of each recording" in page.text("header")
 

@@ -308,7 +308,7 @@ def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Finding
                       lambda stage, share: progress(f"searching effects of the {stage}", 0.7 * share), deadline)
 
     chains, stages, begun = onset.search_within_windows(chains, searched(chains), searched)
-    recordings = chains.recordings
+    recordings = [replace(s, window=c.window) for s, c in zip(recordings, chains.recordings, strict=True)]
     if any(f.cut_short for f in stages.values()):
         recordings = [s.noted(CUT_SHORT) for s in recordings]
     progress("testing for random effects", 0.7)

@@ -188,7 +188,7 @@ def headline(parts: Sequence[Part], share: Mapping[str, Interval], material: flo
     named = sorted((p for p in parts if p.name), key=lambda p: -p.amount)
     claimed = [p for p in named if p.name in share and share[p.name].value >= material]
     effects = _ids(p for p in claimed if p.name != UNKNOWN)
-    small = [e for e in _ids(p for p in named if p not in claimed) if e not in effects]
+    small = [e for e in _ids(p for p in named if p not in claimed and p.name != UNKNOWN) if e not in effects]
     names = {p.name for p in claimed}
     unknown = next((p for p in claimed if p.name == UNKNOWN), None)
     if unknown is not None and (claimed[0] is unknown or not effects or share[UNKNOWN].value > MOSTLY_OPEN):

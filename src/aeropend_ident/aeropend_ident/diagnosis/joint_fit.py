@@ -39,8 +39,10 @@ WIDER = 1.2
 Measured: rigs simulated for the purpose (seeds 11 to 13 of `make blind`); intervals are judged on others."""
 
 
-AGAIN_ROUNDS = 3
-"""Rounds of a fit without one of the effects (choice: it starts close to its end, and only its gap counts)."""
+AGAIN_ROUNDS = 2
+"""Rounds, of one step each, of a fit without one of the effects.
+
+Choice: it starts close to its end, and only its gap counts."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,7 @@ class JointFit:
             return sum(float(np.sum(r * r)) for r in residuals(begun).values())
 
         best = min((self.values, self._expected_without(effects)), key=misfit)
-        return fit(residuals, started(parameters, best), AGAIN_ROUNDS).values
+        return fit(residuals, started(parameters, best), AGAIN_ROUNDS, 1).values
 
     def _expected_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         """The values without some of the effects if the readings were linear in all of them."""

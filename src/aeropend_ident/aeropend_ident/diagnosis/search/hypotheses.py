@@ -49,7 +49,9 @@ STICKING = ("coulomb_friction", "rotor_friction")
 """Effects that can stick."""
 
 REFERENCE_GRAVITY = 33.8
-"""[1/s²] `mgd_over_J` of the rig for which the catalogue's default sizes matter (config/bench.yaml)."""
+"""[1/s²] `mgd_over_J` of the rig for which the catalogue's default sizes matter.
+
+Convention: that of config/bench.yaml."""
 
 OF_THE_ARM = ("rad/s²", "1/s²")
 """Units of sizes that are torques over the arm's inertia: they scale with gravity."""

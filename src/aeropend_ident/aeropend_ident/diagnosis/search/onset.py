@@ -42,6 +42,11 @@ STANDS_OUT = 5.0
 
 Choice: the search itself decides; this only saves time."""
 
+CLOSES = 0.5
+"""Share of the misfit left that an effect with an instant must explain for the search to be made again.
+
+Choice: the larger part. Among many small imperfections some instant always explains a little."""
+
 FOLLOWED, PASSES, ROUNDS = 4, 2, 2
 """Effects that are fitted with their windows, how often the window is moved, and rounds of each fit (choice)."""
 
@@ -237,7 +242,8 @@ def _best_window(chains: CutChains, stage: str, f: Findings, candidates: Sequenc
     tried = [_fitted(chain, stage, f.base, known, window, own) for _, window, own in found[:FOLLOWED]]
     best, window = min(tried, key=lambda one: one[0].mean_square)
     ess = largest_ess([best, f.final])
-    return window if best.log_likelihood(ess) - f.final.log_likelihood(ess) > STANDS_OUT else None
+    stands_out = best.log_likelihood(ess) - f.final.log_likelihood(ess) > STANDS_OUT
+    return window if stands_out and best.mean_square - 1.0 < (1.0 - CLOSES) * (f.final.mean_square - 1.0) else None
 
 
 def _fitted(chain: CutChain, stage: str, base: Fit, known: Sequence[Parameter], window: Window,
