@@ -10,6 +10,7 @@ import sys
 import time
 
 import distributed
+import numpy as np
 import pytest
 from commands import Command
 
@@ -149,6 +150,26 @@ def test_where_nothing_can_be_used_the_exit_code_is_2(recordings, here, tmp_path
     assert all(row["error"] for row in summary(tmp_path / "out"))
     code, _, complained = here("--each", recordings[2], "--out", tmp_path / "one", "--jobs", 1)
     assert (code, complained) == (2, f"diagnose: {recordings[2]}: no such file or folder\n")
+
+
+def test_a_fault_in_one_recording_is_told_and_loses_no_other(here, recordings, bags, tmp_path, monkeypatch):
+    whole = batch.diagnose
+
+    def faulty(model, signals, *arguments, **options):
+        if len(signals[0]) < len(steps(8.0, 0)):
+            raise np.linalg.LinAlgError("Singular matrix")
+        return whole(model, signals, *arguments, **options)
+
+    duty = steps(7.0, 5)
+    columns, _ = rig.record(drawn_rig(5, {}), duty, 5)
+    short = bags.write(tmp_path / "short", bags.content(len(duty), columns={**columns, "duty": duty}))
+    monkeypatch.setattr(batch, "diagnose", faulty)
+    code, out, err = here("--each", short, recordings[0], "--out", tmp_path / "out", "--jobs", 1)
+    assert (code, err) == (0, "")
+    told, done = summary(tmp_path / "out")
+    assert "LinAlgError: Singular matrix" in told["error"]
+    assert done["verdict"] == "none"
+    assert out.splitlines()[-1].startswith("1 of 2 diagnosed")
 
 
 @pytest.mark.parametrize("there", ["third/report.html", "summary.csv"])

@@ -97,6 +97,43 @@ def test_the_verdict_in_a_terminal_tells_the_shares_in_plain_characters():
     assert lines == [printable(line) for line in lines]
 
 
+def with_false_speeds(seed, count):
+    """A recording of a rig that is a little off, with some false speeds, each held until the next pulse."""
+    rng = np.random.default_rng(seed)
+    duty = steps(40.0, seed)
+    columns, _ = rig.record(drawn_rig(seed, {}), duty, seed)
+    omega = columns["omega"].copy()
+    pulses = np.flatnonzero(np.diff(omega)) + 1
+    pulses = pulses[omega[pulses] > 50.0]
+    for k in rng.choice(len(pulses) - 1, count, replace=False):
+        omega[pulses[k]:pulses[k + 1]] *= rng.uniform(1.5, 3.0)
+    return from_arrays({**columns, "omega": omega, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)
+
+
+@pytest.mark.promise("Verdict", "A few false speeds are left out and said; more are the effect `speed_spikes`")
+def test_a_few_false_speeds_leave_no_gap_open():
+    made = diagnose(BENCH, [with_false_speeds(11, 3)], 2)
+    assert made.conclusions.which.verdict == "none"
+    assert made.conclusions.closure.gap_after < 1.2 * made.conclusions.closure.floor
+    assert any("3 false speeds left out" in note for s in made.signals for note in s.notes)
+
+
+@pytest.mark.promise("Verdict", "A few false speeds are left out and said; more are the effect `speed_spikes`")
+def test_some_more_false_speeds_are_the_effect():
+    made = diagnose(BENCH, [with_false_speeds(12, 8)], 2)
+    assert made.conclusions.which.verdict == "speed_spikes"
+    assert not any("false speeds" in note for s in made.signals for note in s.notes)
+
+
+@pytest.mark.parametrize("channel", ["omega", "i_a", "v_a"])
+def test_a_channel_that_was_read_on_held_out_data_only_is_no_reason_to_fail(channel):
+    duty = steps(20.0, 97)
+    columns, _ = rig.record(drawn_rig(97, {"coulomb_friction": {}}), duty, 97)
+    columns[channel] = np.where(np.arange(len(duty)) < 0.7 * len(duty), np.nan, columns[channel])
+    signals = from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)
+    assert diagnose(BENCH, [signals], 2).conclusions.which.verdict == "coulomb_friction"
+
+
 @pytest.mark.promise("Verdict", "The numbers of the measurement chain have tolerances")
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 def test_a_filter_within_its_tolerance_is_no_effect(factor):
@@ -251,7 +288,7 @@ def test_what_is_held_out_moves_no_fit():
     columns, _ = rig.record(drawn_rig(77, {"coulomb_friction": {}}), duty, 77)
     spoilt = {name: x.copy() for name, x in columns.items()}
     for x in spoilt.values():
-        x[round(0.9 * len(duty)):] *= 1.3
+        x[round(0.9 * len(duty)):] *= 2.0
     whole, other = (diagnose(BENCH, [from_arrays({**c, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)], 2).body
                     for c in (columns, spoilt))
     for one in (*whole["which"]["candidates"], *other["which"]["candidates"]):

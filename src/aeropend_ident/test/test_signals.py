@@ -88,11 +88,14 @@ def test_what_cannot_be_compared_is_said(replaced, word):
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("how", ["missing", "at a stop"])
+@pytest.mark.parametrize("how", ["missing", "at a stop", "stuck", "read a few times"])
 def test_an_angle_that_is_not_read_on_held_out_data_is_said(how):
     data = columns(20.0)
     theta = data["theta"].copy()
-    theta[round(0.69 * len(theta)):] = np.nan if how == "missing" else 1.0
+    begin = round({"missing": 0.69, "at a stop": 0.69}.get(how, 0.7) * len(theta))
+    theta[begin:] = {"at a stop": 1.0, "stuck": float(np.median(theta))}.get(how, np.nan)
+    if how == "read a few times":
+        theta[begin + 100:begin + 105] = data["theta"][begin + 100:begin + 105]
     with pytest.raises(RecordingError, match="not read in the part that is held out") as raised:
         from_arrays({**data, "theta": theta}, SAMPLE_PERIOD, BENCH.sensing, name="my_bag")
     assert "\n" not in str(raised.value)
@@ -118,6 +121,29 @@ def test_a_channel_that_never_changes_is_left_out_and_said():
     signals = from_arrays(columns(i_a=np.full(2941, 0.3)), SAMPLE_PERIOD, BENCH.sensing)
     assert not signals.has("i_a")
     assert any("i_a is 0.3 A all the time" in note for note in signals.notes)
+
+
+@pytest.mark.parametrize("channel", ["omega", "i_a", "v_a"])
+@pytest.mark.parametrize("part", ["fitted", "held out"])
+def test_a_channel_that_is_stuck_in_one_part_is_left_out_there_and_said(channel, part):
+    data = columns(20.0)
+    train = round(0.7 * len(data["duty"]))
+    data[channel] = data[channel].copy()
+    data[channel][slice(train) if part == "fitted" else slice(train, None)] = 0.3
+    signals = from_arrays(data, SAMPLE_PERIOD, BENCH.sensing)
+    assert np.isnan(signals.channel(channel)[train:]).all()
+    assert signals.has(channel) == (part == "held out")
+    assert any(f"{channel} is 0.3" in note and f"in the part that is {part}" in note for note in signals.notes)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_channel_that_is_not_read_in_the_part_that_is_fitted_is_left_out_and_said(value):
+    data = columns(20.0)
+    data["i_a"] = data["i_a"].copy()
+    data["i_a"][5:round(0.7 * len(data["duty"]))] = value
+    signals = from_arrays(data, SAMPLE_PERIOD, BENCH.sensing)
+    assert not signals.has("i_a")
+    assert "i_a was not read in the part that is fitted: it is left out" in signals.notes
 
 
 @pytest.mark.promise(

@@ -235,7 +235,7 @@ def _changes_later(gaps: _Gaps) -> bool:
     further = _further(s)
     if len(gaps.held_out.recordings) > 1 or not gaps.held_out.chains.policy.calibrated or s.train >= further:
         return False
-    there = gap(gaps.runs_after[0], s, s.train, further, s.false_speed if gaps.held_out.spikes else None)
+    there = gap(gaps.runs_after[0], s, s.train, further, s.false_speed)
     return any(rms > CHANGED * max(gaps.fitted.rms[c], gaps.floors[c])
                for c, rms in there.rms.items() if c in gaps.fitted.rms)
 
@@ -313,6 +313,8 @@ def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Finding
         recordings = [s.noted(CUT_SHORT) for s in recordings]
     progress("testing for random effects", 0.7)
     spikes = speed_spikes.detect(recordings)
+    if spikes is None:
+        recordings = [s.noted(*speed_spikes.left_out(s)) for s in recordings]
     detected = gust.detect(chains, stages["arm"])
     stages = {**stages, "arm": detected.arm}
     misfit = regions.largest_misfit(chains, stages)

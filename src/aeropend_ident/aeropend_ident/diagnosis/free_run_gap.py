@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.values import with_values, without_effects
 from aeropend_ident.signals.pulses import mean_speed
-from aeropend_ident.signals.signals import CHANNELS, Signals
+from aeropend_ident.signals.signals import CHANNELS, FEWEST, Signals
 from aeropend_sim.model import actuator, dynamics, sensing
 from aeropend_sim.model.parameters import Model
 
@@ -33,9 +33,6 @@ AT_REST = 0.05
 
 STILL_ARM = 0.3
 """Share of its standard deviation over the recording below which the arm rests on held-out data (choice)."""
-
-FEWEST = 10
-"""Readings of a channel below which it has no gap (choice)."""
 
 NOTHING_OPEN = 0.1
 """Gap above the floor, in floors, below which nothing is left to close (choice)."""
@@ -223,7 +220,7 @@ class HeldOut:
         chains: give the values of each recording.
         model: the nominal model.
         recordings: of one rig.
-        spikes: whether `speed_spikes` was detected: false captures then do not count.
+        spikes: whether `speed_spikes` was detected: the gap of the nominal model then counts false captures.
         part: of each recording on which is measured.
     """
 
@@ -254,10 +251,10 @@ class HeldOut:
 
         Args:
             readings: of a model, one a recording.
-            known: whether false captures, if detected, are left out.
+            known: whether false captures are left out that make the effect `speed_spikes`; too few for it always are.
         """
         gaps = [gap(r, s, s.train if self.part == "held out" else 0, s.train if self.part == "fitted" else len(s),
-                    s.false_speed if known and self.spikes else None)
+                    s.false_speed if known or not self.spikes else None)
                 for r, s in zip(readings, self.recordings, strict=True)]
         if len(gaps) == 1:
             return gaps[0]

@@ -26,6 +26,9 @@ UNKNOWN = "unknown"
 LEAST_DRAWN = 1e-3
 """Gap of a resample, relative to the whole, below which its shares mean nothing (choice)."""
 
+LARGEST_UNSURE = 1e3
+"""Relative standard deviation of a size that is zero (choice: its share is then anything, but finite)."""
+
 CAPTURES = "speed_spikes"
 """Name of the part that false captures make."""
 
@@ -91,7 +94,7 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
         size = h.own[0].name
         distance = abs(joint.values[size] - neutral(held_out.model, size))
         return Part(h.name, h.place, without.total**2 - after.total**2, _windows(without) - _windows(after),
-                    joint.sd[size] / max(distance, 1e-300))
+                    min(joint.sd[size] / max(distance, 1e-300), LARGEST_UNSURE))
 
     effects = [h for f in joint.findings.values() for h in f.effects]
     with ThreadPoolExecutor(jobs) as pool:

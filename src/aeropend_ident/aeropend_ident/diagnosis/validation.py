@@ -33,10 +33,11 @@ def validate(model: Model, augmented: Model, signals: Signals) -> ClosedGap:
     """
     first = int(np.argmax(np.isfinite(signals.theta)))
     start = min(first + round(FORGOTTEN / signals.period), len(signals) // 2)
-    left_out = signals.false_speed if "speed_spikes" in augmented.effects else None
+    false = signals.false_speed
+    of_nominal = None if "speed_spikes" in augmented.effects else false  # that effect is part of the gap before
     runs = [free_run_gap.free_run(m, signals, _initial_state(m, signals.head(start))) for m in (model, augmented)]
     before, after = (free_run_gap.gap(run, signals, start, len(signals), leave)
-                     for run, leave in zip(runs, (None, left_out), strict=True))
+                     for run, leave in zip(runs, (of_nominal, false), strict=True))
     floors = free_run_gap.floor(signals, start, len(signals))
     share, low, high = free_run_gap.closure(before, after, floors)
     return ClosedGap(before.total, after.total, before.total_floor(floors), share, low, high)

@@ -31,6 +31,12 @@ MINIMUM_DURATION = 5.0
 STILL = 0.01
 """Change of the duty that is no excitation (choice)."""
 
+AS_MUCH = 0.3
+"""Share of its range that the duty moves in a part of the recording in which a channel then should change (choice)."""
+
+FEWEST = 10
+"""Readings below which a channel was not read (choice: fewer give neither a fit nor a gap)."""
+
 SETTLED = 0.012
 """[s] Time after a step of the duty in which the current shows when the step came, and little else.
 
@@ -161,17 +167,15 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
     for gap in unsure:
         shaken[gap.stop:gap.stop + round(ROTOR * (DIED_AWAY + math.log(gap.stop - gap.start)) / period)] = True
     train = max(1, round(n * (1.0 - held_out)))
-    columns, said = dict(columns), [*notes]
-    for channel in ("omega", "i_a", "v_a"):
-        x = columns[channel][np.isfinite(columns[channel])]
-        if len(x) and np.ptp(x) == 0.0 and np.ptp(duty) > STILL:
-            columns[channel] = np.full(n, np.nan)
-            said.append(f"{channel} is {x[0]:g} {CHANNELS[channel]} all the time, whatever the duty: it is left out")
+    columns, said = {channel: np.where(np.isfinite(x), x, np.nan) for channel, x in columns.items()}, [*notes]
+    said += _leave_out_stuck(columns, duty, train)
+    said += _leave_out_unread(columns, train)
     said += _leave_out(columns, period, train)
+    said += _leave_out_unread(columns, train)
     for part, where in ((slice(train), "fitted"), (slice(train, n), f"held out, the last {n - train} samples")):
-        if n > train and not np.isfinite(columns["theta"][part]).any():
-            raise RecordingError(f"{name}: the arm angle was not read in the part that is {where}: it is missing or at "
-                                 "the end of its range; record again, or cut that part off")
+        if n > train and np.isfinite(columns["theta"][part]).sum() < FEWEST:
+            raise RecordingError(f"{name}: the arm angle was not read in the part that is {where}: it is missing, "
+                                 "stuck or at the end of its range; record again, or cut that part off")
     if np.ptp(columns["theta"][np.isfinite(columns["theta"])]) == 0.0:
         raise RecordingError(f"{name}: the arm angle stays the same all the time: the sensor or the arm is stuck, "
                              "so no verdict is possible")
@@ -243,6 +247,41 @@ def _noise(columns: Mapping[str, Array], duty: Array, sensing: Mapping[str, floa
         stated = math.hypot(sensing[f"{key}_noise"], quantised)
         sigma[channel] = stated if seen is None else max(seen, quantised, least_noise(x))
     return sigma
+
+
+def _leave_out_stuck(columns: dict[str, Array], duty: Array, train: int) -> list[str]:
+    """Replace readings that do not change while the duty does by NaN; returns a note for each channel."""
+    said = []
+    for channel, unit in CHANNELS.items():
+        x = columns[channel]
+        whole = channel != "theta" and _is_stuck(x, duty, STILL)
+        parts = [(slice(None), "")] if whole else [
+            (part, where) for part, where in ((slice(train), " in the part that is fitted"),
+                                              (slice(train, None), " in the part that is held out"))
+            if _is_stuck(x[part], duty[part], AS_MUCH * float(np.ptp(duty)))]
+        for part, where in parts:
+            value = float(x[part][np.isfinite(x[part])][0])
+            said.append(f"{channel} is {value:g} {unit} all the time{where}, whatever the duty: it is left out")
+            columns[channel] = columns[channel].copy()
+            columns[channel][part] = np.nan
+    return said
+
+
+def _leave_out_unread(columns: dict[str, Array], train: int) -> list[str]:
+    """Leave out a channel of the motor that has no readings to fit to; returns a note for each."""
+    said = []
+    for channel in ("omega", "i_a", "v_a"):
+        known = np.isfinite(columns[channel])
+        if known.any() and known[:train].sum() < FEWEST:
+            columns[channel] = np.full(len(known), np.nan)
+            said.append(f"{channel} was not read in the part that is fitted: it is left out")
+    return said
+
+
+def _is_stuck(x: Array, duty: Array, moved: float) -> bool:
+    """Whether a channel (N,) does not change while the duty (N,) moves by more than `moved`."""
+    known = x[np.isfinite(x)]
+    return bool(len(known) and np.ptp(known) == 0.0 and np.ptp(duty) > moved)
 
 
 def _leave_out(columns: dict[str, Array], period: float, train: int) -> list[str]:

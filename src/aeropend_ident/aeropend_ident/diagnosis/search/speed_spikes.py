@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import expit
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
@@ -14,6 +15,7 @@ from aeropend_ident.diagnosis.search.findings import RankedHypothesis
 from aeropend_ident.diagnosis.search.hypotheses import EFFECT_ODDS, Hypothesis
 from aeropend_ident.estimation.map_fit import estimate
 from aeropend_ident.signals.signals import Signals
+from aeropend_sim.wording import counted
 
 ANY_RIG = 0.02
 """[1/s] Rate of false captures that any rig may show (choice: one in 50 s).
@@ -34,7 +36,7 @@ def detect(recordings: Sequence[Signals]) -> RankedHypothesis | None:
     """
     count, time = 0, 0.0
     for s in recordings:
-        count += int(np.sum(np.diff(s.false_speed[: s.train].astype(int)) == 1))
+        count += _count(s.false_speed[:s.train])
         # a false capture needs a pulse: there is none while the rotor stands
         time += float(s.pulses.period[s.pulses.index < s.train].sum()) if s.pulses else s.train * s.period
     if count < FEWEST:
@@ -46,6 +48,17 @@ def detect(recordings: Sequence[Signals]) -> RankedHypothesis | None:
     name = "speed_spikes.rate"
     rate, sd = count / time, math.sqrt(count) / time
     return RankedHypothesis(Hypothesis("speed_spikes"), estimate({name: rate}, {name: sd}), gain, float(expit(gain)))
+
+
+def left_out(s: Signals) -> tuple[str, ...]:
+    """A note on the false captures of a recording that are too few for the effect; empty if there are none."""
+    count = _count(s.false_speed)
+    return (f"omega: {counted(count, 'false speed')} left out, too few to be an effect",) if count else ()
+
+
+def _count(false: NDArray[np.bool_]) -> int:
+    """Runs of false samples (N,)."""
+    return int(np.sum(np.diff(false.astype(int), prepend=0) == 1))
 
 
 def squared_gap(chains: CutChains) -> float:
