@@ -316,7 +316,7 @@ def _arm(stage: _Stage) -> Places:
               *stage.curves(["theta_dot"], "-", force, share), *stage.curves(["omega, slowly"], "-", force, share),
               *stage.curves(["slope of omega"], "rad/s²")]
     arm = [*stage.curves(["theta", "theta_dot", "t"], "rad/s²"), *stage.curves(["theta"], "1/s", rate, " (damping)")]
-    shown = stage.curves(["theta", "theta_dot"], "rad")
+    shown = stage.curves(["theta", "theta_dot", "t"], "rad")
     reading = sensing.prepare(model.with_effects({}), s.period)
     columns = np.array([sensing.angle_reading(np.ascontiguousarray(c), np.gradient(c, s.period), reading)
                         for c in _stacked(shown)])
