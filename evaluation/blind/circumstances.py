@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The blind check of rigs as they are: many small imperfections, feedback, wrong noise, lost samples, three effects.
+"""The blind check of rigs as they are: many small imperfections, feedback, wrong noise, lost samples, change in time.
 
 Each circumstance is a row of its own. The rigs are those of `plant`; what a recording holds is drawn here. The share of
 an effect in the gap is that of the mean square which no refit of the numbers absorbs.
@@ -8,7 +8,7 @@ an effect in the gap is that of the mean square which no refit of the numbers ab
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,13 @@ from scipy.optimize import lsq_linear
 
 from aeropend_ident.testing import bags
 from aeropend_sim.model.parameters import load
-from evaluation.blind import cases, folder, page, plant, score
+from evaluation.blind import cases, changes, controllers, folder, page, plant, score
 from evaluation.blind.plant import EFFECTS, OUTSIDE, PERIOD
 
 Array = NDArray[np.float64]
 
-ROWS = {"messy": 0.4, "closed loop": 0.2, "nothing missing": 0.25, "three effects": 0.15}
+ROWS = {"messy": 0.3, "closed loop": 0.15, "nothing missing": 0.2, "three effects": 0.1, "onset": 0.19,
+        "slow drift": 0.06}
 """Circumstance -> share of the recordings."""
 
 BACKGROUND = (10, 12)
@@ -154,40 +155,6 @@ def three(effects: Sequence[str], rng: np.random.Generator, numbers: Mapping[str
     return drawn, shares
 
 
-def relay(rng: np.random.Generator) -> Callable[[float, float], float]:
-    """A controller with two levels and a hysteresis."""
-    low, high, goal = rng.uniform(0.0, 0.15), rng.uniform(0.35, 0.5), rng.uniform(0.15, 0.5)
-    memory = {"u": high}
-
-    def law(t: float, theta: float) -> float:
-        wanted = goal + 0.1 * math.sin(0.5 * t)
-        if abs(theta - wanted) > 0.03:
-            memory["u"] = high if theta < wanted else low
-        return memory["u"]
-
-    return law
-
-
-def lead(rng: np.random.Generator) -> Callable[[float, float], float]:
-    """A lead compensator around the duty that holds the arm, following a slow triangle."""
-    gain, mean, period = rng.uniform(0.2, 0.5), rng.uniform(0.2, 0.3), rng.uniform(6.0, 15.0)
-    zero, pole = rng.uniform(2.0, 4.0), rng.uniform(20.0, 40.0)
-    memory = {"error": 0.0, "u": 0.0}
-
-    def law(t: float, theta: float) -> float:
-        goal = 0.1 + 0.5 * abs(2.0 * (t / period % 1.0) - 1.0)
-        error = goal - theta
-        keep = math.exp(-pole * PERIOD)
-        memory["u"] = keep * memory["u"] + gain * pole / zero * (error - memory["error"] * math.exp(-zero * PERIOD))
-        memory["error"] = error
-        return min(max(mean + memory["u"], 0.0), 0.7)
-
-    return law
-
-
-CONTROLLERS = (cases.pid, relay, lead)
-
-
 def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing: Mapping[str, float], seed: int,
          duration: float) -> tuple[dict[str, Any], dict[str, Array], NDArray[np.bool_]]:
     """A recording of a circumstance.
@@ -209,6 +176,9 @@ def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing
     label: dict[str, Any] = {"row": row, "shares": {}, "effects": [], "seed": seed}
     own = dict(sensing)
     lost = np.zeros(len(duty), dtype=bool)
+    if row in changes.ROWS:
+        entry, columns = changes.make(effects[0], numbers, nominal, sensing, duty, rng)
+        return {**label, "effects": [entry]}, {**columns, "duty": duty}, lost
     controller, gusts, other = None, np.zeros(0), True
     if row in {"messy", "three effects"}:
         drawn, label["shares"] = (messy(rng, numbers, sensing, duty) if row == "messy" else
@@ -224,7 +194,7 @@ def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing
             lost[1:-1] = rng.random(len(lost) - 2) < rng.choice([0.0, 0.01, 0.05, 0.2])
             label["sensing"], label["lost"] = own, float(lost.mean())
         if row == "closed loop" or (row == "nothing missing" and rng.random() < 0.3):
-            controller = CONTROLLERS[rng.integers(len(CONTROLLERS))](rng)
+            controller = controllers.ALL[rng.integers(len(controllers.ALL))](rng)
         other = bool(rng.random() < 0.5)
         rig = cases.Sizer(numbers, own, duty) if effects else None
         inside: dict[str, dict[str, float]] = {}
@@ -249,16 +219,16 @@ def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing
 def plan(count: int, seed: int) -> list[tuple[str, list[str]]]:
     """Circumstance and effects of each recording."""
     rng = np.random.default_rng([seed, 23])
-    singles = [*EFFECTS, "parameter_mismatch"]
+    in_turn = {"closed loop": [*EFFECTS, "parameter_mismatch"], **changes.ROWS}
     rows: list[tuple[str, list[str]]] = []
     for row, part in ROWS.items():
         for k in range(round(part * count)):
             effects: list[str] = []
             scalable = [e for e in EFFECTS if e not in RANDOM_OR_STEPPED]
-            if row == "closed loop":
-                if k % len(singles) == 0:
-                    order = rng.permutation(singles)
-                effects = [str(order[k % len(singles)])]
+            if row in in_turn:
+                if k % len(in_turn[row]) == 0:
+                    order = rng.permutation(in_turn[row])
+                effects = [str(order[k % len(in_turn[row])])]
             elif row == "three effects":
                 while len({cases.PLACES[e] for e in effects}) < 3:
                     effects = [str(e) for e in rng.choice(scalable, 3, replace=False)]
@@ -286,11 +256,13 @@ class Judged:
         label: as sealed.
         answer: of the diagnosis.
         shares: effect -> share of the gap as stated, and its 95 % interval, where there is one.
+        instants: "since" and "until" of the effects found, [s].
     """
 
     label: Mapping[str, Any]
     answer: score.Answer
     shares: Mapping[str, tuple[float, float, float]]
+    instants: Sequence[tuple[str, float]] = ()
 
     @property
     def main(self) -> Mapping[str, Any] | None:
@@ -312,6 +284,12 @@ class Judged:
     def placed(self) -> bool:
         """Whether the place is that of the main effect."""
         return self.main is not None and self.answer.place == self.main["place"]
+
+    @property
+    def timed(self) -> bool:
+        """Whether an effect was found that begins, or ends, when the main effect does."""
+        main = self.main or {}
+        return any(which in main and abs(at - main[which]) < changes.NEAR for which, at in self.instants)
 
     @property
     def main_share(self) -> float:
@@ -343,7 +321,9 @@ def judged(out: Path) -> list[Judged]:
         body = verdicts[label["name"]]
         shares = {c["effect"]: (c["share"]["value"], c["share"]["low"], c["share"]["high"])
                   for c in body.get("which", {}).get("candidates", ()) if c.get("share")}
-        found.append(Judged(label, score.answer_of_diagnosis(body), shares))
+        instants = [(which, c[which]["value"]) for c in body.get("which", {}).get("candidates", ()) if c["found"]
+                    for which in ("since", "until") if c.get(which)]
+        found.append(Judged(label, score.answer_of_diagnosis(body), shares, instants))
     return found
 
 
@@ -368,6 +348,10 @@ def figures(found: Sequence[Judged]) -> list[score.Figure]:
               [j.answer.first != "none" for j in rows["nothing missing"]], at_most=0.03),
         share("three effects: all named", [j.keys <= set(j.answer.found) for j in rows["three effects"]],
               at_least=0.85),
+        share("onset: right effect first", right(rows["onset"]), at_least=0.90),
+        share("onset: begins or ends within 0.5 s", [j.timed for j in rows["onset"]], at_least=0.95),
+        share("slow drift of a reading or a force: right place", [j.placed for j in rows["slow drift"]],
+              at_least=0.90),
         score.median("seconds, median", seconds, at_most=5.0),
         score.Figure("seconds, longest", max(seconds, default=None), count=len(seconds), at_most=20.0, share=False),
     ]

@@ -243,8 +243,8 @@ def _recursive(x: Array, keep: float) -> Array:
     return out
 
 
-def states(p: Array, duty: Array, gusts: Array, controller: Callable[[float, float], float] | None = None
-           ) -> tuple[Array, Array, Array]:
+def states(p: Array, duty: Array, gusts: Array, controller: Callable[[float, float], float] | None = None,
+           later: tuple[int, Array] | None = None) -> tuple[Array, Array, Array]:
     """Integrate from rest.
 
     Args:
@@ -252,6 +252,7 @@ def states(p: Array, duty: Array, gusts: Array, controller: Callable[[float, flo
         duty: (N,) held from each sample to the next.
         gusts: (N + 2,) or (0,).
         controller: (t, angle shown) -> duty, in place of `duty`.
+        later: sample from which on other parameters hold, and these; not with a controller or a delay.
 
     Returns:
         States (N, 16), terminal voltage (N,), duty (N,).
@@ -281,14 +282,17 @@ def states(p: Array, duty: Array, gusts: Array, controller: Callable[[float, flo
         starts, stops, levels = np.append(0.0, starts), np.append(starts[1:2], stops), np.append(0.0, levels)
         starts[1], stops[0] = delay, delay
     done = 0
-    for a, b, u in zip(starts, stops, levels, strict=True):
+    change, after = (math.inf, p) if later is None else (later[0] * PERIOD, later[1])
+    pieces = [(max(a, low), min(b, high), u, q) for a, b, u in zip(starts, stops, levels, strict=True)
+              for low, high, q in ((0.0, change, p), (change, math.inf, after)) if a < high and b > low]
+    for a, b, u, q in pieces:
         last = max(done, min(n, math.ceil((b - 1e-12) / PERIOD)))
         grid = np.concatenate([[a], np.arange(done, last) * PERIOD, [b]])
         if b <= a:
             continue
-        path = odeint(derivative, y, np.maximum(grid, a), (u, p, gusts, room), tcrit=[b], **options)
+        path = odeint(derivative, y, np.maximum(grid, a), (u, q, gusts, room), tcrit=[b], **options)
         out[done:last] = path[1:-1]
-        v[done:last] = voltages(u, done, out[done:last], p)
+        v[done:last] = voltages(u, done, out[done:last], q)
         y, done = path[-1], last
     return out, v, applied
 
@@ -330,10 +334,12 @@ def speed_from_pulses(turned: Array, omega: Array, start: float, tick: float, sp
     return np.where(since > 0.5, 0.0, out)
 
 
-def measured(p: Array, y: Array, v: Array, sensing: Mapping[str, float], rng: np.random.Generator) -> dict[str, Array]:
-    """Readings (N,) as the rig reports them."""
-    ideal = shown(p, y, v)
-    n = len(v)
+def measured(p: Array, y: Array, v: Array, sensing: Mapping[str, float], rng: np.random.Generator,
+             later: tuple[int, Array] | None = None) -> dict[str, Array]:
+    """Readings (N,) as the rig reports them; `later` as for `states`."""
+    ideal, n = shown(p, y, v), len(v)
+    if later is not None:
+        ideal = {c: np.append(x[:later[0]], shown(later[1], y, v)[c][later[0]:]) for c, x in ideal.items()}
 
     def digits(x: Array, noise: float, lsb: float) -> Array:
         x = x + noise * rng.standard_normal(n)

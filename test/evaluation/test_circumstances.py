@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from evaluation.blind import cases, circumstances, plant
+from evaluation.blind import cases, changes, circumstances, plant
 from evaluation.blind.circumstances import Judged
 from evaluation.blind.score import Answer
 
@@ -30,12 +30,41 @@ def test_three_effects_are_at_three_places():
 
 @pytest.mark.parametrize("row", circumstances.ROWS)
 def test_a_recording_is_made_of_each_circumstance(row):
-    effects = {"closed loop": ["gust"], "three effects": ["gust", "supply_sag", "thrust_lag"]}.get(row, [])
+    effects = {"closed loop": ["gust"], "three effects": ["gust", "supply_sag", "thrust_lag"],
+               "onset": ["thrust_lag"], "slow drift": ["sensing"]}.get(row, [])
     label, columns, lost = circumstances.make(row, effects, BENCH.model, BENCH.sensing, 5, 10.0)
     assert label["row"] == row
     assert all(np.isfinite(x).all() for x in columns.values())
     assert not lost[0]
     assert bool(label["effects"]) == (row != "nothing missing")
+
+
+@pytest.mark.parametrize("effect", ["thrust_lag", "current_offset"])
+def test_an_effect_begins_or_ends_at_its_instant(effect):
+    duty = cases.duty_signal(np.random.default_rng(8), 10.0)
+    without = plant.packed(BENCH.model, BENCH.sensing["angle_filter_tau"], {}, {}, other=False)
+    y, v, _ = plant.states(without, duty, np.zeros(0))
+    ideal, seen = plant.shown(without, y, v), set()
+    for seed in range(6):
+        entry, columns = changes.onset(effect, BENCH.model, BENCH.model, BENCH.sensing, duty,
+                                       np.random.default_rng(seed))
+        (which,) = {"since", "until"} & set(entry)
+        seen.add(which)
+        k = round(entry[which] / plant.PERIOD)
+        assert 0.15 * len(duty) <= k <= 0.85 * len(duty)
+        off = max(np.sqrt(np.mean((columns[c] - ideal[c])[:k] ** 2)) / BENCH.sensing[noise]
+                  for c, noise in (("theta", "angle_noise"), ("i_a", "current_noise")))
+        assert (off < 3.0) == (which == "since")
+    assert seen == {"since", "until"}
+
+
+def test_a_slow_drift_moves_the_reading_or_the_arm_by_as_much():
+    rng = np.random.default_rng(2)
+    duty = np.zeros(round(20.0 / plant.PERIOD))
+    for place in changes.DRIFTING:
+        entry, columns = changes.drift(place, BENCH.model, BENCH.sensing, duty, rng)
+        assert entry["place"] == place
+        assert np.ptp(columns["theta"]) == pytest.approx(abs(entry["parameters"]["size"]), abs=0.02)
 
 
 def judged(row, effects, shares, first, found, stated=None, place="arm"):
@@ -68,3 +97,12 @@ def test_each_figure_of_the_circumstances_can_fail():
     loop = "closed loop: right effect first"
     assert values(judged("closed loop", ["gust"], {}, "gust", ["gust"]))[loop] == 1.0
     assert values(judged("closed loop", ["gust"], {}, "none", []))[loop] == 0.0
+    begun = {"effect": "gust", "place": "arm", "parameters": {}, "since": 20.0}
+    for instants, first, expected in (([("since", 20.4)], "gust", (1.0, 1.0)), ([("since", 20.6)], "gust", (1.0, 0.0)),
+                                      ([("until", 20.0)], "none", (0.0, 0.0)), ([("since", 19.8)], "x", (0.0, 1.0))):
+        found = values(Judged({"row": "onset", "shares": {}, "effects": [begun]},
+                              Answer(first, (first,), place="arm", seconds=1.0), {}, instants))
+        assert tuple(found[f"onset: {n}"] for n in ("right effect first", "begins or ends within 0.5 s")) == expected
+    drift = "slow drift of a reading or a force: right place"
+    assert values(judged("slow drift", ["drift"], {}, "unknown", [], place="arm"))[drift] == 1.0
+    assert values(judged("slow drift", ["drift"], {}, "unknown", [], place="sensing"))[drift] == 0.0
