@@ -24,12 +24,12 @@ FLOORS = (3.0, 10.0)
 Choice: a smaller one shows when it acts, but not to half a second."""
 
 NEAR = 0.5
-"""[s] Distance from the true instant within which an effect's begin or end is found."""
+"""[s] Distance from the true instant, or from one that nothing tells from it, within which it is found."""
 
 DRIFT = (0.02, 0.08)
 """[rad] Range over which the angle drifts in a recording, or a force turns the hanging arm."""
 
-NO_INSTANT = ("command_delay", "speed_spikes", "gust", "supply_drift")
+NO_INSTANT = ("command_delay", "speed_spikes", "gust", "supply_drift", "winding_heating")
 """Effects without an instant that a recording shows: random ones, a delay of the command, and what grows from zero."""
 
 WITHOUT = {"thrust_lag_tau": 1e-3}
@@ -66,7 +66,8 @@ def onset(effect: str, numbers: Mapping[str, float], nominal: Mapping[str, float
         rng: of all that is drawn.
 
     Returns:
-        The effect with its instant, "since" or "until" [s], and the channels (N,).
+        The effect with its instant, "since" or "until" [s], and the earliest and the latest instant that would change
+        no reading by a floor, "hidden" [s]; and the channels (N,).
     """
     other = bool(rng.random() < 0.5)
     rig = cases.Sizer(numbers, sensing, duty)
@@ -84,7 +85,29 @@ def onset(effect: str, numbers: Mapping[str, float], nominal: Mapping[str, float
     before, after = (without, with_) if begins else (with_, without)
     y, v, _ = plant.states(before, duty, np.zeros(0), later=(k, after))
     columns = plant.measured(before, y, v, sensing, rng, later=(k, after))
-    return {**entry, "since" if begins else "until": k * PERIOD}, columns
+
+    def read(at: int) -> dict[str, Array]:
+        y, v, _ = plant.states(before, duty, np.zeros(0), later=(at, after))
+        return plant.ideal(before, y, v, (at, after))
+
+    def hides(at: int) -> bool:
+        other = read(at) if 0 < at < len(duty) else None
+        return other is not None and all(np.abs(other[c] - mine[c]).max() < rig.floor[c] for c in mine)
+
+    mine, step = read(k), round(NEAR / PERIOD)
+    hidden = [k, k]
+    for side, way in enumerate((-step, step)):
+        while hides(hidden[side] + way):
+            hidden[side] += way
+    return {**entry, "since" if begins else "until": k * PERIOD, "hidden": [h * PERIOD for h in hidden]}, columns
+
+
+def in_time(effect: Mapping[str, Any], which: str, at: float) -> bool:
+    """Whether a begin ("since") or end ("until") at an instant [s] is that of an effect, as far as it shows.
+
+    A rig that rests does not show that its supply sags: no recording tells then when that began.
+    """
+    return which in effect and effect["hidden"][0] - NEAR < at < effect["hidden"][1] + NEAR
 
 
 def drift(place: str, numbers: Mapping[str, float], sensing: Mapping[str, float], duty: Array,

@@ -288,8 +288,7 @@ class Judged:
     @property
     def timed(self) -> bool:
         """Whether an effect was found that begins, or ends, when the main effect does."""
-        main = self.main or {}
-        return any(which in main and abs(at - main[which]) < changes.NEAR for which, at in self.instants)
+        return self.main is not None and any(changes.in_time(self.main, *one) for one in self.instants)
 
     @property
     def main_share(self) -> float:

@@ -309,6 +309,14 @@ def shown(p: Array, y: Array, v: Array) -> dict[str, Array]:
     return {"theta": y[:, S.stage2], "omega": y[:, S.omega], "i_a": read, "v_a": v + p[I.voltage_offset_bias]}
 
 
+def ideal(p: Array, y: Array, v: Array, later: tuple[int, Array] | None = None) -> dict[str, Array]:
+    """As `shown`, of a rig that changes; `later` as for `states`."""
+    first = shown(p, y, v)
+    if later is None:
+        return first
+    return {c: np.append(first[c][:later[0]], x[later[0]:]) for c, x in shown(later[1], y, v).items()}
+
+
 def speed_from_pulses(turned: Array, omega: Array, start: float, tick: float, spikes: float, other: bool,
                       rng: np.random.Generator) -> Array:
     """Speed as held between pulses, one a revolution (docs/interfaces.md), with false captures."""
@@ -337,9 +345,7 @@ def speed_from_pulses(turned: Array, omega: Array, start: float, tick: float, sp
 def measured(p: Array, y: Array, v: Array, sensing: Mapping[str, float], rng: np.random.Generator,
              later: tuple[int, Array] | None = None) -> dict[str, Array]:
     """Readings (N,) as the rig reports them; `later` as for `states`."""
-    ideal, n = shown(p, y, v), len(v)
-    if later is not None:
-        ideal = {c: np.append(x[:later[0]], shown(later[1], y, v)[c][later[0]:]) for c, x in ideal.items()}
+    exact, n = ideal(p, y, v, later), len(v)
 
     def digits(x: Array, noise: float, lsb: float) -> Array:
         x = x + noise * rng.standard_normal(n)
@@ -347,6 +353,6 @@ def measured(p: Array, y: Array, v: Array, sensing: Mapping[str, float], rng: np
 
     pulses = speed_from_pulses(y[:, S.turned], y[:, S.omega], rng.uniform(0.0, 2.0 * math.pi), sensing["speed_tick"],
                                p[I.speed_spikes_rate], bool(p[I.other_form]), rng)
-    return {"theta": digits(ideal["theta"], sensing["angle_noise"], sensing["angle_lsb"]), "omega": pulses,
-            "i_a": digits(ideal["i_a"], sensing["current_noise"], sensing["current_lsb"]),
-            "v_a": digits(ideal["v_a"], sensing["voltage_noise"], sensing["voltage_lsb"])}
+    return {"theta": digits(exact["theta"], sensing["angle_noise"], sensing["angle_lsb"]), "omega": pulses,
+            "i_a": digits(exact["i_a"], sensing["current_noise"], sensing["current_lsb"]),
+            "v_a": digits(exact["v_a"], sensing["voltage_noise"], sensing["voltage_lsb"])}

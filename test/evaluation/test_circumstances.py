@@ -50,6 +50,7 @@ def test_an_effect_begins_or_ends_at_its_instant(effect):
                                        np.random.default_rng(seed))
         (which,) = {"since", "until"} & set(entry)
         seen.add(which)
+        assert entry["hidden"][0] <= entry[which] <= entry["hidden"][1]
         k = round(entry[which] / plant.PERIOD)
         assert 0.15 * len(duty) <= k <= 0.85 * len(duty)
         off = max(np.sqrt(np.mean((columns[c] - ideal[c])[:k] ** 2)) / BENCH.sensing[noise]
@@ -97,9 +98,11 @@ def test_each_figure_of_the_circumstances_can_fail():
     loop = "closed loop: right effect first"
     assert values(judged("closed loop", ["gust"], {}, "gust", ["gust"]))[loop] == 1.0
     assert values(judged("closed loop", ["gust"], {}, "none", []))[loop] == 0.0
-    begun = {"effect": "gust", "place": "arm", "parameters": {}, "since": 20.0}
-    for instants, first, expected in (([("since", 20.4)], "gust", (1.0, 1.0)), ([("since", 20.6)], "gust", (1.0, 0.0)),
-                                      ([("until", 20.0)], "none", (0.0, 0.0)), ([("since", 19.8)], "x", (0.0, 1.0))):
+    begun = {"effect": "gust", "place": "arm", "parameters": {}, "since": 20.0, "hidden": [19.0, 21.0]}
+    for instants, first, expected in (
+            ([("since", 21.4)], "gust", (1.0, 1.0)), ([("since", 21.6)], "gust", (1.0, 0.0)),
+            ([("since", 18.4)], "gust", (1.0, 0.0)), ([("until", 20.0)], "none", (0.0, 0.0)),
+            ([("since", 18.6)], "x", (0.0, 1.0))):
         found = values(Judged({"row": "onset", "shares": {}, "effects": [begun]},
                               Answer(first, (first,), place="arm", seconds=1.0), {}, instants))
         assert tuple(found[f"onset: {n}"] for n in ("right effect first", "begins or ends within 0.5 s")) == expected

@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -256,8 +257,13 @@ class _Stage:
 
     def curves(self, names: Sequence[str], unit: str, factor: Array | float = 1.0, said: str = "") -> Columns:
         """Curves of some variables, times a factor; `said` is added to their names."""
-        return [(name + said, unit, self.knots[name],
-                 np.ascontiguousarray(hats(self.variables[name], self.knots[name]).T * factor)) for name in names]
+        return [(name + said, unit, self.knots[name], np.ascontiguousarray(
+            hats(self.variables[name], self.knots[name]).T * factor * self.acts)) for name in names]
+
+    @cached_property
+    def acts(self) -> Array:
+        """(N,) 1 where effects act that the model lacks, 0 elsewhere."""
+        return np.concatenate([np.full(p.stop - p.start, float(on)) for p, on in self.chain.signals.acting()])
 
     def free_in_time(self, unit: str) -> Columns:
         """A term that is free in time: it shows which place fits, whatever the term depends on."""

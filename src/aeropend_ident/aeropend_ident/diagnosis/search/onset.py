@@ -20,9 +20,11 @@ from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.chain.values import STAGES
 from aeropend_ident.diagnosis.document import Interval
 from aeropend_ident.diagnosis.policy import MATERIAL
-from aeropend_ident.diagnosis.search.findings import Findings
+from aeropend_ident.diagnosis.search.findings import Findings, adopted
+from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import EFFECT_ODDS, Hypothesis, hypotheses, stages_of
 from aeropend_ident.diagnosis.search.search import passes_as_noise
+from aeropend_ident.diagnosis.search.selection import CLOSE_GAIN, FORM_SHOWS
 from aeropend_ident.estimation.map_fit import Fit, Search, fit, largest_ess
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.signals import Signals
@@ -49,6 +51,9 @@ Choice: the larger part. Among many small imperfections some instant always expl
 
 FOLLOWED, PASSES, ROUNDS = 4, 2, 2
 """Effects that are fitted with their windows, how often the window is moved, and rounds of each fit (choice)."""
+
+FOUND = 0.5
+"""[s] Distance of two windows' instants above which both are searched (choice: what counts as found)."""
 
 NEAR = 0.05
 """[s] Distance of an instant from its estimate within which the search is not made again (choice: a tenth of what
@@ -91,39 +96,75 @@ def search_within_windows(chains: CutChains, findings: dict[str, Findings],
     Returns:
         The chains, the findings and the onset of the better search; without an onset those that were given.
     """
-    window = suspected(chains, findings)
-    for _ in range(PASSES if window else 0):
-        assert window is not None
+    found: _Within | None = None
+    for window in suspected(chains, findings):
+        one = _searched_within(chains, findings, window, searched)
+        if one is not None and (found is None or _fits_better(found, one)):
+            found = one
+    return found or (chains, findings, None)
+
+
+_Within = tuple[CutChains, dict[str, Findings], Onset]
+"""Chains with a window, what was found within it, and when that begins or ends."""
+
+
+def _searched_within(chains: CutChains, findings: Mapping[str, Findings], window: Window,
+                     searched: Callable[[CutChains], dict[str, Findings]]) -> _Within | None:
+    """Search within a window, and again where the instant moves; None: the search without an instant is better."""
+    found: _Within | None = None
+    for _ in range(PASSES):
         again = with_window(chains, window)
         within = searched(again)
         if not is_better(findings, within, chains.recordings[0]):
+            return None
+        found = again, within, located(again, within)
+        moved = found[2].window
+        if abs(sum(moved) - sum(window)) * chains.recordings[0].period < NEAR:
             break
-        onset = located(again, within)
-        if abs(sum(onset.window) - sum(window)) * chains.recordings[0].period < NEAR:
-            return again, within, onset
-        window = onset.window
-    else:
-        return (again, within, onset) if window else (chains, findings, None)
-    return chains, findings, None
+        window = moved
+    return found
 
 
-def suspected(chains: CutChains, findings: Mapping[str, Findings]) -> Window | None:
-    """The window that explains most in the first stage that is not explained; None: none stands out.
+def _fits_better(one: _Within, other: _Within) -> bool:
+    """Whether another window is the better one: by log evidence, or by free curves where no effect's form fits.
+
+    The right effect needs free curves at its own place for its form only; a wrong one needs them at another place.
+    """
+    (_, once, _), (_, again, _) = one, other
+    open_ = [b for b in once if once[b].found and again[b].found
+             and min(once[b].final.mean_square, again[b].final.mean_square) > FORM_SHOWS]
+    if not open_ or once[open_[0]].effects[0].place == again[open_[0]].effects[0].place:
+        return gained(once, again) > 0.0
+    return _left_at_its_place(other, open_[0]) < _left_at_its_place(one, open_[0])
+
+
+def _left_at_its_place(found: _Within, stage: str) -> float:
+    """Mean square that the first effect of a stage leaves with free curves at its place, all within its window."""
+    chains, findings, _ = found
+    best = findings[stage].found[0][0]
+    terms = missing_terms(chains, stage, best.fit, adopted(nominal_parameters(chains, stage), best.hypothesis))
+    return min((t.left for t in terms if t.place == best.hypothesis.place), default=best.fit.mean_square)
+
+
+def suspected(chains: CutChains, findings: Mapping[str, Findings]) -> list[Window]:
+    """The windows that explain most in the first stage that is not explained, if any stands out.
+
+    Two effects that are alike may fit about as well, each within a window of its own.
 
     Args:
         chains: cut; of several recordings, and of an uncalibrated rig, whose searches are long, none is suspected.
         findings: what the search found with effects that act all the time.
     """
     if len(chains.each) > 1 or not chains.policy.calibrated:
-        return None
+        return []
     every = hypotheses(chains.model, mismatches=False)
     for stage in STAGES:
         f = findings[stage]
         if not f.base.residuals or passes_as_noise(f.final, MATERIAL):
             continue
         mine = [h for h in every if stages_of(chains, h)[:1] == (stage,)]
-        return _best_window(chains, stage, f, mine)
-    return None
+        return _best_windows(chains, stage, f, mine)
+    return []
 
 
 def with_window(chains: CutChains, window: Window) -> CutChains:
@@ -135,11 +176,16 @@ def with_window(chains: CutChains, window: Window) -> CutChains:
 def is_better(once: Mapping[str, Findings], again: Mapping[str, Findings], signals: Signals) -> bool:
     """Whether a search with a window has more evidence than one without, its instant and its prior odds included."""
     tried = 2.0 * signals.train * signals.period / GRID
-    gain = math.log(EFFECT_ODDS / tried)
+    return math.log(EFFECT_ODDS / tried) + gained(once, again) > 0.0 and any(f.found for f in again.values())
+
+
+def gained(once: Mapping[str, Findings], again: Mapping[str, Findings]) -> float:
+    """Log evidence that another search of the same recording has more."""
+    gain = 0.0
     for stage, f in again.items():
         ess = largest_ess([f.final, once[stage].final])
         gain += f.final.log_evidence(ess) - once[stage].final.log_evidence(ess)
-    return gain > 0.0 and any(f.found for f in again.values())
+    return gain
 
 
 def located(chains: CutChains, findings: Mapping[str, Findings]) -> Onset:
@@ -190,8 +236,8 @@ def _moved(window: Window, k: int, *, begins: bool) -> Window:
     return (k, window[1]) if begins else (window[0], k)
 
 
-def _best_window(chains: CutChains, stage: str, f: Findings, candidates: Sequence[Hypothesis]) -> Window | None:
-    """The window in which an effect explains most of the misfit, if it stands out."""
+def _best_windows(chains: CutChains, stage: str, f: Findings, candidates: Sequence[Hypothesis]) -> list[Window]:
+    """The windows in which an effect explains most of the misfit, if it stands out."""
     chain = chains.each[0]
     signals = chain.signals
     known = [p for p in nominal_parameters(chains, stage) if p.name in f.base.values]
@@ -205,7 +251,7 @@ def _best_window(chains: CutChains, stage: str, f: Findings, candidates: Sequenc
     edge = round(SHORTEST / signals.period)
     instants = np.arange(edge, signals.train - edge, max(round(GRID / signals.period), 1))
     if not len(instants):
-        return None
+        return []
     cuts = np.searchsorted(at[order], instants)
     information = jacobian @ jacobian.T + np.eye(len(known))
     inverse = np.linalg.inv(information)
@@ -236,14 +282,19 @@ def _best_window(chains: CutChains, stage: str, f: Findings, candidates: Sequenc
                 k = int(np.argmax(gain))
                 window = (int(instants[k]), len(signals)) if begins else (0, int(instants[k]))
                 found.append((float(gain[k]), window, own))
-    if not found:
-        return None
     found.sort(key=lambda one: -one[0])
     tried = [_fitted(chain, stage, f.base, known, window, own) for _, window, own in found[:FOLLOWED]]
-    best, window = min(tried, key=lambda one: one[0].mean_square)
-    ess = largest_ess([best, f.final])
-    stands_out = best.log_likelihood(ess) - f.final.log_likelihood(ess) > STANDS_OUT
-    return window if stands_out and best.mean_square - 1.0 < (1.0 - CLOSES) * (f.final.mean_square - 1.0) else None
+    ess = largest_ess([f.final, *(one for one, _ in tried)])
+    open_ = (1.0 - CLOSES) * (f.final.mean_square - 1.0)
+    likely = sorted(((one.log_likelihood(ess), window) for one, window in tried if one.mean_square - 1.0 < open_),
+                    reverse=True)
+    least = f.final.log_likelihood(ess) + STANDS_OUT
+    windows: list[Window] = []
+    for likelihood, window in likely:
+        apart = all(max(abs(a - b) for a, b in zip(window, w, strict=True)) * signals.period > FOUND for w in windows)
+        if apart and likelihood > max(least, likely[0][0] - CLOSE_GAIN):
+            windows.append(window)
+    return windows
 
 
 def _fitted(chain: CutChain, stage: str, base: Fit, known: Sequence[Parameter], window: Window,
