@@ -10,7 +10,7 @@ import pytest
 
 from aeropend_ident.bags.recording import Recording, RecordingError
 from aeropend_ident.commands.diagnose import main
-from aeropend_ident.diagnosis import policy
+from aeropend_ident.diagnosis import joint_fit, policy
 from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model, fit_with_effect
@@ -131,6 +131,24 @@ def test_what_brakes_a_swing_is_named_at_20_hz_and_one_degree(effect, parameters
     found = candidate(body, effect)["parameters"][name]
     assert found["low"] < true < found["high"]
     assert body["shrink"]["closed"] > 0.8
+
+
+def test_a_pooled_interval_holds_how_recordings_differ():
+    assert joint_fit.pooled_sd([1.0, 1.001, 0.999], [0.3, 0.3, 0.3]) == pytest.approx(0.3 / math.sqrt(3.0))
+    assert joint_fit.pooled_sd([1.0, 2.0, 3.0], [0.01, 0.01, 0.01]) == pytest.approx(1.0 / math.sqrt(3.0), rel=0.01)
+
+
+@pytest.mark.promise("Uncalibrated rigs", "The interval of several recordings holds their run-to-run spread")
+def test_friction_that_varies_from_decay_to_decay_has_the_interval_of_its_mean():
+    true = (0.44, 0.33, 0.26, 0.49)
+    swings = [from_uncalibrated(recording(*let_go(20.0, {"coulomb_friction": {"accel": friction}}, damping=0.15, seed=k,
+                                                  rate=50.0, lsb=0.2 * DEGREE)), BENCH.sensing)
+              for k, friction in enumerate(true)]
+    body = diagnose(BENCH, swings, 2, fit_nominal=True).body
+    assert body["which"]["effects"] == ["coulomb_friction"]
+    accel = candidate(body, "coulomb_friction")["parameters"]["accel"]
+    assert accel["low"] < np.mean(true) < accel["high"]
+    assert accel["high"] - accel["low"] > 2.0 * 1.96 * 0.7 * np.std(true, ddof=1) / math.sqrt(len(true))
 
 
 @pytest.mark.promise("Uncalibrated rigs", "Irregular stamps and a clock that wanders are no effect")

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,8 +19,8 @@ from aeropend_ident.diagnosis.search.findings import Findings, Selection
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
 from aeropend_ident.diagnosis.search.search import refit, within_prior
-from aeropend_ident.estimation.map_fit import Fit, fit
-from aeropend_ident.estimation.parameter import Parameter, started
+from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess
+from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.statistics import Z95, rms
 from aeropend_sim.model.parameters import Model
 
@@ -43,6 +43,9 @@ AGAIN_ROUNDS = 2
 """Rounds, of one step each, of a fit without one of the effects.
 
 Choice: it starts close to its end, and only its gap counts."""
+
+OTHER_SIZES = (0.6, 0.8, 1.25, 1.6)
+"""Factors on the size of an effect from which a recording alone is fitted too (choice: swings have local minima)."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +114,22 @@ class JointFit:
         return {n: min(max(every[n].value(x), every[n].low), every[n].high) for n, x in zip(names, z, strict=True)}
 
 
+def pooled_sd(values: Sequence[float], sd: Sequence[float]) -> float:
+    """Standard deviation of the mean over recordings, with the scatter from recording to recording.
+
+    Random effects, by moments (R. DerSimonian, N. Laird: Meta-analysis in clinical trials. 1986).
+
+    Args:
+        values: (R,) estimates, one a recording.
+        sd: (R,) their standard deviations.
+    """
+    x, variance = np.asarray(values), np.square(sd)
+    w = 1.0 / variance
+    scatter = float(np.sum(w * (x - np.average(x, weights=w)) ** 2))
+    between = (scatter - (len(x) - 1)) / float(np.sum(w) - np.sum(w**2) / np.sum(w))
+    return 1.0 / math.sqrt(float(np.sum(1.0 / (variance + max(between, 0.0)))))
+
+
 def fit_jointly(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool) -> JointFit:
     """Fit all together until each effect that is left is certain enough to be claimed.
 
@@ -121,7 +140,7 @@ def fit_jointly(chains: CutChains, findings: Mapping[str, Findings], *, gust: bo
     """
     found = dict(findings)
     joint, values, sd = _fitted(chains, found)
-    while weak := _least_certain(chains, found, values, sd):
+    while weak := _least_certain(chains, found, joint, sd):
         stage, selection = weak
         found[stage] = found[stage].without(selection)
         joint, values, sd = _fitted(chains, found)
@@ -146,7 +165,32 @@ def _fitted(chains: CutChains, findings: Mapping[str, Findings]) -> tuple[Fit, d
     for f in findings.values():
         start.update(f.final.values)
     joint = fit(chains.joined(_free_run_residuals(chains)), started(_parameters(chains, findings).values(), start))
-    return joint, joint.values, {name: WIDER * sd for name, sd in joint.sd.items()}
+    return joint, joint.values, _with_run_to_run(chains, findings, joint)
+
+
+def _with_run_to_run(chains: CutChains, findings: Mapping[str, Findings], joint: Fit) -> dict[str, float]:
+    """Standard deviations of a joint fit; those of shared values hold how they differ between recordings.
+
+    Each recording is fitted alone, from the values of all.
+    """
+    sd = {name: WIDER * s for name, s in joint.sd.items()}
+    if len(chains.each) < 2:
+        return sd
+    alone = []
+    for k in range(len(chains.each)):
+        one, start = chains.only(k), chains.values_of(joint.values, k)
+        residuals = one.joined(_free_run_residuals(one))
+        sizes = [h.own[0].name for f in findings.values() for h in f.effects]
+        starts = [start, *({**start, n: factor * start[n]} for n in sizes for factor in OTHER_SIZES)]
+        fits = [fit(residuals, started(_parameters(one, findings).values(), s)) for s in starts]
+        ess = largest_ess(fits)
+        alone.append(max(fits, key=lambda f: f.log_likelihood(ess) + f.log_prior))
+    own = {key(name).plain for name in sd if key(name).recording}
+    for name, alike in joint.sd.items():
+        if not key(name).is_initial and key(name).plain not in own and all(name in f.values for f in alone):
+            values, own_sd = [f.values[name] for f in alone], [WIDER * f.sd[name] for f in alone]
+            sd[name] = max(WIDER * alike, pooled_sd(values, own_sd))
+    return sd
 
 
 def _parameters(chains: CutChains, findings: Mapping[str, Findings]) -> dict[str, Parameter]:
@@ -209,15 +253,16 @@ def _widened(chains: CutChains, findings: Mapping[str, Findings], values: Mappin
     return wider
 
 
-def _least_certain(chains: CutChains, findings: Mapping[str, Findings], values: Mapping[str, float],
-                   sd: Mapping[str, float]) -> tuple[str, Selection] | None:
+def _least_certain(chains: CutChains, findings: Mapping[str, Findings], joint: Fit, sd: Mapping[str, float]
+                   ) -> tuple[str, Selection] | None:
     """The finding whose size is least certain, if that is too uncertain to be claimed."""
-    model, certain = chains.model, []
+    model, values, certain = chains.model, joint.values, []
     for stage, f in findings.items():
         for selection in f.found:
-            if selection[0].gain > CERTAIN and not selection[0].hypothesis.parameter:
-                continue  # its existence is certain; only its size and those of other values cannot be separated
             size = selection[0].hypothesis.own[0].name
+            contradicted = sd[size] > WIDER * joint.sd[size]  # recordings differ by more than their uncertainty
+            if selection[0].gain > CERTAIN and not selection[0].hypothesis.parameter and not contradicted:
+                continue  # its existence is certain; only its size and those of other values cannot be separated
             spread = max(sd[size], NOMINAL_SD * abs(model.model[size]) if size in model.model else 0.0)
             certain.append((abs(values[size] - neutral(model, size)) / spread, stage, selection))
     worst = min(certain, key=lambda c: c[0], default=None)

@@ -306,6 +306,12 @@ class CutChains:
                 left -= chain.signals.train
         return out
 
+    def only(self, k: int) -> CutChains:
+        """The chain of one recording alone."""
+        out = copy(self)
+        out.each = [self.each[k]]
+        return out
+
     def set_next_input(self, stage: str, values: Values) -> None:
         """Set the input of the stage after this one to what was measured, described with these values."""
         for k, chain in enumerate(self.each):
