@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from aeropend_ident.testing import bags
-from aeropend_sim.model.parameters import load
-from evaluation.blind import cases, changes, controllers, folder, page, plant, score
+from aeropend_sim.model.parameters import Model, load
+from evaluation.blind import cases, changes, controllers, folder, other_rigs, page, plant, score
 from evaluation.blind.plant import EFFECTS, OUTSIDE, PERIOD
 
 Array = NDArray[np.float64]
 
-ROWS = {"messy": 0.3, "closed loop": 0.15, "nothing missing": 0.2, "three effects": 0.1, "onset": 0.19,
-        "slow drift": 0.06}
+ROWS = {"messy": 0.28, "closed loop": 0.14, "nothing missing": 0.18, "three effects": 0.1, "onset": 0.17,
+        "slow drift": 0.05, "other rigs": 0.08}
 """Circumstance -> share of the recordings."""
 
 BACKGROUND = (10, 12)
@@ -219,7 +219,7 @@ def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing
 def plan(count: int, seed: int) -> list[tuple[str, list[str]]]:
     """Circumstance and effects of each recording."""
     rng = np.random.default_rng([seed, 23])
-    in_turn = {"closed loop": [*EFFECTS, "parameter_mismatch"], **changes.ROWS}
+    in_turn = {"closed loop": [*EFFECTS, "parameter_mismatch"], "other rigs": other_rigs.EFFECTS, **changes.ROWS}
     rows: list[tuple[str, list[str]]] = []
     for row, part in ROWS.items():
         for k in range(round(part * count)):
@@ -241,6 +241,12 @@ def make_all(out: Path, count: int, seed: int, duration: float, jobs: int) -> No
     nominal = load(folder.MODEL)
 
     def one(k: int, row: tuple[str, list[str]]) -> dict[str, Any]:
+        if row[0] == "other rigs":
+            rng = np.random.default_rng([seed * 100_019 + k, 19])
+            made = other_rigs.make(row[1][0], nominal.model, nominal.sensing, duration, rng)
+            bags.write(out / "recordings" / f"c{k:03d}", made.columns, round(made.period * 1e9))
+            folder.write_model(out, f"c{k:03d}", Model("rig", made.model, made.sensing))
+            return {"name": f"c{k:03d}", "row": row[0], "shares": {}, **made.label}
         label, columns, lost = make(*row, nominal.model, nominal.sensing, seed * 100_019 + k, duration)
         bags.write(out / "recordings" / f"c{k:03d}", columns, round(PERIOD * 1e9), lost)
         return {"name": f"c{k:03d}", **label}
@@ -351,6 +357,7 @@ def figures(found: Sequence[Judged]) -> list[score.Figure]:
         share("onset: begins or ends within 0.5 s", [j.timed for j in rows["onset"]], at_least=0.95),
         share("slow drift of a reading or a force: right place", [j.placed for j in rows["slow drift"]],
               at_least=0.90),
+        share("other rigs: right effect, or none, first", right(rows["other rigs"]), at_least=0.90),
         score.median("seconds, median", seconds, at_most=5.0),
         score.Figure("seconds, longest", max(seconds, default=None), count=len(seconds), at_most=20.0, share=False),
     ]

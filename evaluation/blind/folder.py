@@ -18,7 +18,7 @@ from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.document import to_json
 from aeropend_ident.diagnosis.results import document
 from aeropend_ident.signals.from_bag import signals_of
-from aeropend_sim.model.parameters import load
+from aeropend_sim.model.parameters import Model, load
 
 MODEL = "bench"
 """Model file whose numbers the rigs are drawn around (choice)."""
@@ -39,6 +39,18 @@ def make_all(out: Path, rows: Sequence[Any], one: Callable[[int, Any], dict[str,
     (out / SEALED).write_bytes(zlib.compress(json.dumps(labels).encode()))
 
 
+def write_model(out: Path, name: str, model: Model) -> None:
+    """Write the model file of a recording whose rig is not drawn around `MODEL`; it is no secret."""
+    (out / "models").mkdir(exist_ok=True)
+    (out / "models" / f"{name}.json").write_text(json.dumps({"model": model.model, "sensing": model.sensing}))
+
+
+def model_of(out: Path, name: str) -> Model:
+    """The model file of a recording."""
+    own = out / "models" / f"{name}.json"
+    return Model(name, **json.loads(own.read_text())) if own.exists() else load(MODEL)
+
+
 def diagnose_all(out: Path, jobs: int, only: Sequence[str] = (), *, fit_nominal: bool = False) -> None:
     """Write a verdict for each recording; the labels stay sealed.
 
@@ -48,11 +60,10 @@ def diagnose_all(out: Path, jobs: int, only: Sequence[str] = (), *, fit_nominal:
         only: names of the recordings to diagnose; all without it.
         fit_nominal: whether the rigs are uncalibrated, as for `diagnose --fit-nominal`.
     """
-    model = load(MODEL)
     (out / "verdicts").mkdir(exist_ok=True)
 
     def one(_: int, name: str) -> None:
-        started = time.perf_counter()
+        started, model = time.perf_counter(), model_of(out, name)
         try:
             signals = signals_of(out / "recordings" / name, None, model.sensing, fit_nominal=fit_nominal)
             result = diagnose(model, [signals], 1, fit_nominal=fit_nominal)
