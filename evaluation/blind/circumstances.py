@@ -46,6 +46,10 @@ LARGEST, LARGEST_SMALL = 1.5, 0.4
 GHOST = 0.03
 """True share of the gap below which an effect that is claimed is not there."""
 
+RESOLUTION, JITTER = (0.7, 1.3), 0.1
+"""Resolutions and tick over those of the model file, and sample instants off by up to so many periods, if nothing is
+missing."""
+
 RANDOM_OR_STEPPED = ("command_delay", "speed_spikes", "current_clip", "slew_limit", "brown_outs")
 """Effects whose gap does not grow in proportion to their size: they are no imperfections of a messy rig."""
 
@@ -170,7 +174,7 @@ def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing
     Returns:
         Its label, its channels (N,), and which samples were lost (N,).
     """
-    rng = np.random.default_rng([seed, 19])
+    rng, chain = np.random.default_rng([seed, 19]), np.random.default_rng([seed, 29])
     numbers = {k: v * (1.0 + rng.uniform(-cases.OFF, cases.OFF)) for k, v in nominal.items()}
     duty = cases.duty_signal(rng, duration)
     label: dict[str, Any] = {"row": row, "shares": {}, "effects": [], "seed": seed}
@@ -191,6 +195,8 @@ def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing
             for name in ("angle_noise", "current_noise", "voltage_noise"):
                 own[name] *= 3.0 ** rng.uniform(-1.0, 1.0)
             own["angle_filter_tau"] *= rng.uniform(0.9, 1.1)
+            for name in ("angle_lsb", "current_lsb", "voltage_lsb", "speed_tick"):
+                own[name] *= chain.uniform(*RESOLUTION)
             lost[1:-1] = rng.random(len(lost) - 2) < rng.choice([0.0, 0.01, 0.05, 0.2])
             label["sensing"], label["lost"] = own, float(lost.mean())
         if row == "closed loop" or (row == "nothing missing" and rng.random() < 0.3):
@@ -213,6 +219,8 @@ def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing
             entry.pop("draw", None)
         p = plant.packed(numbers, own["angle_filter_tau"], inside, {}, other)
     y, v, applied = plant.states(p, duty, gusts, controller)
+    if row == "nothing missing":
+        y = plant.at_other_instants(y, JITTER, chain)
     return label, {**plant.measured(p, y, v, own, rng), "duty": applied}, lost
 
 

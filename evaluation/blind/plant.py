@@ -309,6 +309,15 @@ def shown(p: Array, y: Array, v: Array) -> dict[str, Array]:
     return {"theta": y[:, S.stage2], "omega": y[:, S.omega], "i_a": read, "v_a": v + p[I.voltage_offset_bias]}
 
 
+def at_other_instants(y: Array, share: float, rng: np.random.Generator) -> Array:
+    """States (N, 16) with angle and current sampled up to a share of the period early or late."""
+    t, moved = np.arange(len(y)), np.array(y)
+    at = np.clip(t + share * rng.uniform(-1.0, 1.0, len(y)), 0, len(y) - 1)
+    for state in (S.stage2, S.i):
+        moved[:, state] = np.interp(at, t, y[:, state])
+    return moved
+
+
 def ideal(p: Array, y: Array, v: Array, later: tuple[int, Array] | None = None) -> dict[str, Array]:
     """As `shown`, of a rig that changes; `later` as for `states`."""
     first = shown(p, y, v)

@@ -145,6 +145,18 @@ def test_a_filter_within_its_tolerance_is_no_effect(factor):
 
 
 @pytest.mark.promise("Verdict", "The numbers of the measurement chain have tolerances")
+@pytest.mark.parametrize(("name", "factor"), [("angle_filter_tau", 0.8), ("angle_filter_tau", 1.2),
+                                              ("speed_tick", 4.0), ("current_lsb", 2.0)])
+def test_a_measurement_chain_that_is_off_is_no_effect_of_the_rig(name, factor):
+    sensing = {**BENCH.sensing, name: factor * BENCH.sensing[name]}
+    duty = steps(40.0, 96)
+    columns, _ = rig.record(Model("rig", drawn_rig(96, {}).model, sensing), duty, 96)
+    which = diagnose(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)], 2).body["which"]
+    assert set(which["effects"]) <= {"encoder_lag"}
+    assert which["verdict"] in {"none", "encoder_lag"}
+
+
+@pytest.mark.promise("Verdict", "The numbers of the measurement chain have tolerances")
 def test_a_filter_that_is_much_faster_is_a_negative_lag():
     body = diagnose(BENCH, [filtered(0.2)], 2).body
     assert body["which"]["verdict"] == "encoder_lag"
