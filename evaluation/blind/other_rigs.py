@@ -25,6 +25,9 @@ DAMPING = (0.01, 0.15)
 LIFTS = (0.7, 1.4)
 """Lift over gravity, relative to the preset."""
 
+HIGHEST = 1.6
+"""[rad] Largest angle; the duty is lowered until the arm stays below it (a person would not let it spin)."""
+
 EVERY = (1, 2, 5, 10, 24)
 """Samples of the plant between two of the recording: 490 to 20 Hz."""
 
@@ -80,6 +83,9 @@ def make(effect: str, preset: Mapping[str, float], sensing: Mapping[str, float],
     every = int(rng.choice(EVERY))
     duty = pulses(rng, duration, slower) if rng.random() < PULSED else driven(rng, duration, slower)
     duty = np.repeat(duty[::every], every)[:len(duty)]
+    bare = plant.packed(numbers, own["angle_filter_tau"], {}, {}, other=False)
+    while np.abs(plant.states(bare, duty, np.zeros(0))[0][:, plant.S.theta]).max() > HIGHEST:
+        duty = 0.8 * duty
     label: dict[str, Any] = {"effects": [], "gravity": gravity, "rate": 1.0 / (every * PERIOD)}
     inside: dict[str, Mapping[str, float]] = {}
     other = bool(rng.random() < 0.5)

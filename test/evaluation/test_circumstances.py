@@ -64,6 +64,7 @@ def test_other_rigs_are_slow_and_fast_and_have_model_files_of_their_own(tmp_path
     assert len({round(one.label["rate"]) for one in made}) > 1
     for one in made:
         assert 0.9 * other_rigs.GRAVITY[0] < one.model["mgd_over_J"] < 1.1 * other_rigs.GRAVITY[1]
+        assert np.abs(one.columns["theta"]).max() < other_rigs.HIGHEST + 0.5
         assert all(len(x) == pytest.approx(10.0 / one.period, abs=1) for x in one.columns.values())
     folder.write_model(tmp_path, "c001", Model("rig", made[0].model, made[0].sensing))
     assert folder.model_of(tmp_path, "c001").model == made[0].model
