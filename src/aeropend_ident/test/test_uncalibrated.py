@@ -13,10 +13,9 @@ from aeropend_ident.commands.diagnose import main
 from aeropend_ident.diagnosis import joint_fit, policy
 from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
 from aeropend_ident.diagnosis.chain.chain import CutChains
-from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model, fit_with_effect
+from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.experiment_design import experiments_within
-from aeropend_ident.diagnosis.search.hypotheses import hypotheses
 from aeropend_ident.diagnosis.validation import validate
 from aeropend_ident.signals.free_decay import free_swings
 from aeropend_ident.signals.from_bag import from_uncalibrated
@@ -258,11 +257,9 @@ def test_angle_and_command_alone_name_an_effect_in_an_uncalibrated_rig():
 def test_an_effect_of_the_drive_is_identified_together_with_the_numbers(effect, parameter, size):
     model, read = unknown(4, {effect: {parameter: size}}, duration=25.0)
     signals = from_uncalibrated(read, BENCH.sensing)
-    misled, _ = fit_nominal_model(BENCH, [signals])
-    (own,) = next(h.own for h in hypotheses(BENCH) if h.effect == effect)
-    found = fit_with_effect(misled, [signals], own)
-    assert found[own.name] == pytest.approx(size, rel=0.25)
-    assert found["mgd_over_J"] == pytest.approx(model.model["mgd_over_J"], rel=0.05)
+    found, _ = fit_nominal_model(BENCH, [signals])
+    assert found.effect(effect, parameter) == pytest.approx(size, rel=0.25)
+    assert found.model["mgd_over_J"] == pytest.approx(model.model["mgd_over_J"], rel=0.05)
 
 
 def test_chance_is_not_taken_for_what_it_looks_like():

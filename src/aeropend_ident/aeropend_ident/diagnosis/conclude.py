@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aeropend_ident.diagnosis import experiment_design
-from aeropend_ident.diagnosis.chain import nominal_fit
+from aeropend_ident.diagnosis.chain import driven_rig
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import OF_THE_ARM, UNCALIBRATED_SD, ZERO, basis, model_parameters
 from aeropend_ident.diagnosis.chain.values import FILTER, STAGES, neutral, of_rig, with_values
@@ -127,7 +127,7 @@ def identified_model(chains: CutChains, joint: JointFit, rows: Mapping[str, Para
     recordings, values = chains.recordings, joint.values
     lift, hangs = None, None
     if "k3" in values and angle_only(recordings):
-        lift = nominal_fit.lift(with_values(chains.model, chains.values_of(values, 0)), recordings)
+        lift = driven_rig.lift(with_values(chains.model, chains.values_of(values, 0)), recordings)
     if ZERO in values:
         one, own = _interval(values[ZERO], joint.sd[ZERO]), _over_recordings(ZERO, values, joint.sd)
         mean = one if own is None else own.mean

@@ -21,6 +21,7 @@ from aeropend_ident.diagnosis import conclude, gap_share, regions, typed_json
 from aeropend_ident.diagnosis.chain import static_map
 from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
 from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.driven_rig import without_findings
 from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model
 from aeropend_ident.diagnosis.chain.pwm_timing import with_pwm_timing
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, PLACE_OF_PARAMETER, neutral, of_rig, with_values
@@ -113,12 +114,17 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
         seconds: [s] that the search may take; None: a budget of simulations bounds it where it may be long.
     """
     with threadpool_limits(1):  # the matrices are narrow: threads of the linear algebra would slow each other down
+        likely: Mapping[str, float] = {}
         if fit_nominal:
             progress("identifying the nominal model", 0.0)
-            model, recordings = fit_nominal_model(model, recordings)
+            given = model
+            model, recordings = fit_nominal_model(given, recordings)
+            model, likely = without_findings(model, given)
         policy = policy_of(recordings, fit_nominal=fit_nominal)
         kind = CutChains if policy.calibrated else CachedChains
-        return _diagnose(with_pwm_timing(kind(model, recordings, policy)), Settings(jobs, material, seconds), progress)
+        chains = with_pwm_timing(kind(model, recordings, policy))
+        chains.likely = likely
+        return _diagnose(chains, Settings(jobs, material, seconds), progress)
 
 
 @dataclass(frozen=True)

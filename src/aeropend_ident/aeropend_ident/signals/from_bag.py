@@ -22,7 +22,7 @@ from aeropend_ident.signals.free_decay import degrees, free_decay
 from aeropend_ident.signals.grid import check_period, irregular_grid, longest_piece, regular_grid
 from aeropend_ident.signals.noise import reading_noise_at
 from aeropend_ident.signals.pulses import hold
-from aeropend_ident.signals.signals import CHANNELS, STILL, Signals, from_arrays
+from aeropend_ident.signals.signals import CHANNELS, MINIMUM_DURATION, STILL, Signals, from_arrays
 
 Array = NDArray[np.float64]
 
@@ -48,6 +48,11 @@ MOVES = 3.0
 """Standard deviations of a reading that a channel must vary by to show that the motor runs (choice).
 
 Measured: at ±30 % no verdict of 5 recordings changes (docs/results/thresholds.md)."""
+
+
+RESTS, SETTLES, MOSTLY = 0.02, 0.05, 0.5
+"""Change of angle and duty, over their range, that is rest; time after the last motion, over that before it, that is
+kept; and share of the held-out part that rests from which on it is left out (choice)."""
 
 
 def signals_of(bag: str | Path, namespace: str | None, sensing: Mapping[str, float], held_out: float = 0.3, *,
@@ -134,14 +139,39 @@ def from_uncalibrated(read: Recording, sensing: Mapping[str, float], held_out: f
                         for c in ("omega", "i_a", "v_a")):
         return free_decay(read, columns["theta"], period, sigma["theta"], held_out,
                           commanded=bool(np.isfinite(duty).any()))
+    notes = read.notes
     if np.isfinite(duty).any():
         columns["duty"] = hold(duty)
-    signals = from_arrays(columns, period, own, held_out, read.path, read.notes)
+        last = end_of_motion(columns["theta"], columns["duty"], sigma["theta"], held_out) if alone else 0
+        if last * period >= MINIMUM_DURATION:
+            columns = {name: x[:last] for name, x in columns.items()}
+            notes = (*notes, f"the arm rests under a constant duty from {last * period:.1f} s on: the rest is left out")
+    signals = from_arrays(columns, period, own, held_out, read.path, notes)
     if signals.pulses is not None:  # the accuracy of the speed is that of its pulses
         sigma.pop("omega", None)
     said = (f"angle: a reading has a standard deviation of {degrees(sigma['theta'])}, from noise and resolution, "
             "estimated from the recording")
     return replace(signals, sigma={**signals.sigma, **sigma}).noted(said)
+
+
+def end_of_motion(theta: Array, duty: Array, sigma: float, held_out: float) -> int:
+    """Samples after which an arm rests under a constant duty, if most of the held-out part is such a rest; else 0.
+
+    Where nothing happens, no model can be judged.
+
+    Args:
+        theta: [rad] (N,) angle, NaN where missing.
+        duty: (N,) duty.
+        sigma: [rad] standard deviation of a reading.
+        held_out: share of the recording at its end that models are not fitted to.
+    """
+    known = np.flatnonzero(np.isfinite(theta))
+    x = theta[known]
+    away = np.abs(x - np.median(x[-max(len(x) // 50, 1):])) > max(MOVES * sigma, RESTS * float(np.ptp(x)))
+    changed = np.flatnonzero(np.abs(duty - duty[-1]) > RESTS * float(np.ptp(duty)))
+    last = max(int(known[away][-1]) if away.any() else 0, int(changed[-1]) if len(changed) else 0) + 1
+    kept = min(round((1.0 + SETTLES) * last), len(duty))
+    return kept if kept < (1.0 - MOSTLY * held_out) * len(duty) else 0
 
 
 def with_commands(duty: Array, read: Recording, index: NDArray[np.int64]) -> Array:

@@ -9,7 +9,7 @@ output leaves, without the noise.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -263,6 +263,7 @@ class CutChains:
 
     def __init__(self, model: Model, recordings: Sequence[Signals], policy: Policy = CALIBRATED) -> None:
         self.model, self.policy = model, policy
+        self.likely: Mapping[str, float] = {}  # sizes of effects with which the parameters were identified
         self.each = [self._cut(signals) for signals in recordings]
 
     def _cut(self, signals: Signals) -> CutChain:

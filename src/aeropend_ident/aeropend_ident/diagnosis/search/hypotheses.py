@@ -10,8 +10,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aeropend_ident.diagnosis.chain.chain import DELAY, CutChains
-from aeropend_ident.diagnosis.chain.priors import initial_states
+from aeropend_ident.diagnosis.chain.priors import (
+    CHOSEN,
+    FINDINGS,
+    SIZE_SD,
+    initial_states,
+    model_parameters,
+    usual_size,
+)
 from aeropend_ident.diagnosis.chain.values import PLACE_OF_PARAMETER, STAGES
+from aeropend_ident.diagnosis.policy import angle_only
 from aeropend_ident.estimation.parameter import Parameter
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
 from aeropend_sim.model.parameters import PARAMETERS, Model
@@ -30,11 +38,6 @@ EFFECT_ODDS = 1.0 / 50.0
 
 Measured: at ±30 % no verdict of 23 recordings changes (docs/results/thresholds.md)."""
 
-SIZE_SD = 3.0
-"""Standard deviation of an effect's size, in default sizes: rigs may show several times the default (choice).
-
-Measured: ×0.7 changes 1 of 25 verdicts, ×1.3 none (docs/results/thresholds.md)."""
-
 FIRST_SIZE = 0.3
 """Size, in default sizes, from which a search starts (choice).
 
@@ -47,14 +50,6 @@ Choice: what sticks at once gives no gradient."""
 
 STICKING = ("coulomb_friction", "rotor_friction")
 """Effects that can stick."""
-
-REFERENCE_GRAVITY = 33.8
-"""[1/s²] `mgd_over_J` of the rig for which the catalogue's default sizes matter.
-
-Convention: that of config/bench.yaml."""
-
-OF_THE_ARM = ("rad/s²", "1/s²")
-"""Units of sizes that are torques over the arm's inertia: they scale with gravity."""
 
 SAME = 1e-6
 """Change of a residual, in units of a reading's noise, that is rounding (choice).
@@ -70,11 +65,13 @@ class Hypothesis:
         effect: id of the effect.
         parameter: of the model, for `parameter_mismatch`; else "".
         starts: start points of searches, each the effect's own parameters, its size first.
+        begun: names and values from which a search starts, if it was identified with the nominal model.
     """
 
     effect: str
     parameter: str = ""
     starts: tuple[tuple[Parameter, ...], ...] = ()
+    begun: tuple[tuple[str, float], ...] = ()
 
     @property
     def name(self) -> str:
@@ -144,19 +141,6 @@ def _starts(id_: str, model: Model) -> Iterable[tuple[Parameter, ...]]:
     return [(head, first, *(g[len(g) // 2] for g in grids[1:])) for first in grids[0]]
 
 
-def usual_size(id_: str, model: Model) -> float:
-    """The size of an effect that matters on a rig: the catalogue's default, in the rig's own units.
-
-    Args:
-        id_: of the effect.
-        model: the nominal model of the rig.
-    """
-    size = CATALOGUE[id_].parameters[CATALOGUE[id_].size]
-    if size.unit not in OF_THE_ARM:
-        return size.default
-    return size.neutral + (size.default - size.neutral) * model.model["mgd_over_J"] / REFERENCE_GRAVITY
-
-
 def stages_of(chains: CutChains, hypothesis: Hypothesis) -> tuple[str, ...]:
     """The stages whose residuals a hypothesis changes, found by trying it."""
     values: dict[str, float]
@@ -190,6 +174,22 @@ def delay_from_voltage(chains: CutChains, hypothesis: Hypothesis, values: Mappin
     own = hypothesis.own[0]
     assert own.name == DELAY
     return replace(hypothesis, starts=((replace(own, mean=start, start=start),),))
+
+
+def is_decided(chains: CutChains, hypothesis: Hypothesis) -> bool:
+    """Whether the identification of the nominal model has decided on an effect that such a model may hold."""
+    return (chains.policy.wide_search and angle_only(chains.recordings) and hypothesis.effect not in FINDINGS
+            and hypothesis.own[0].name in CHOSEN)
+
+
+def as_identified(chains: CutChains, hypothesis: Hypothesis) -> Hypothesis:
+    """An effect with which the parameters of the nominal model were identified starts from what was identified."""
+    own = {p.name: chains.likely[p.name] for p in hypothesis.own if p.name in chains.likely}
+    if not own:
+        return hypothesis
+    numbers = {p.name: p.mean for p in model_parameters(chains, "arm")}
+    starts = (tuple(replace(p, start=own.get(p.name, p.start)) for p in hypothesis.own), *hypothesis.starts)
+    return replace(hypothesis, starts=starts, begun=tuple({**numbers, **own}.items()))
 
 
 def linear_parameters(id_: str) -> list[Parameter]:

@@ -16,7 +16,14 @@ from aeropend_ident.diagnosis.chain.values import STAGES
 from aeropend_ident.diagnosis.policy import MATERIAL
 from aeropend_ident.diagnosis.search.findings import Findings, adopted, drop_unneeded
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
-from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, delay_from_voltage, hypotheses, stages_of
+from aeropend_ident.diagnosis.search.hypotheses import (
+    Hypothesis,
+    as_identified,
+    delay_from_voltage,
+    hypotheses,
+    is_decided,
+    stages_of,
+)
 from aeropend_ident.diagnosis.search.selection import CONTENDERS, ROUNDS, SelectionRound, log_evidence_over
 from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess
 from aeropend_ident.estimation.parameter import Parameter, started
@@ -66,7 +73,8 @@ def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], No
         Stage -> what was found.
     """
     findings: dict[str, Findings] = {}
-    everything = hypotheses(chains.model, mismatches=chains.policy.calibrated)
+    everything = [as_identified(chains, h) for h in hypotheses(chains.model, mismatches=chains.policy.calibrated)
+                  if not is_decided(chains, h)]
     acts_on = {h.name: stages_of(chains, h) for h in everything}
     carried: dict[str, Parameter] = {}
     with ThreadPoolExecutor(jobs) as pool:
@@ -136,8 +144,6 @@ def _select(here: SelectionRound, findings: Findings, candidates: list[Hypothesi
     tried = here.converged(tried, rounds, but=lead)
     if not policy.wide_search and not any(passes_as_noise(f, MATERIAL) for _, f in tried):
         tried = here.multi_started(tried)
-    if not findings.found:
-        tried = here.refitted_with_nominal(open_, tried)
     ranked = here.ranked(tried)
     # the parameters that the best hypothesis was led to may serve as well without it
     again = fit(chains.residuals(here.stage), started(here.known, ranked[0].fit.values))

@@ -4,7 +4,7 @@
 The order, as `search` calls it: `screened` (linear algebra leaves a shortlist, which is fitted for some rounds),
 `warm_started` (uncalibrated rigs: the best is fitted to its end, the others start again from its parameters),
 `converged` (the contenders are fitted to their end), `multi_started` (from their other start points),
-`refitted_with_nominal` (uncalibrated rigs: identified again together with the nominal model), `ranked`.
+`ranked`.
 """
 
 from __future__ import annotations
@@ -17,11 +17,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aeropend_ident.diagnosis.chain import nominal_fit
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD, nominal_parameters
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF
-from aeropend_ident.diagnosis.policy import angle_only
 from aeropend_ident.diagnosis.search.findings import RankedHypothesis, Selection, adopted
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, from_linear, linear_parameters
@@ -123,7 +121,8 @@ class SelectionRound:
                 best[h.name] = (x, h, j)
         ranked = [(h, j) for _, h, j in sorted(best.values(), key=lambda item: item[0])]
         # a parameter that is far off already explains nothing more as a mismatch; its wider prior only fits better
-        misplaced = [(h, j) for h, j in ranked[SHORTLIST:] if h.parameter and self._misplaced(h.parameter)]
+        misplaced = [(h, j) for h, j in ranked[SHORTLIST:]
+                     if h.begun or (h.parameter and self._misplaced(h.parameter))]
         return ranked[:SHORTLIST] + misplaced
 
     def _misplaced(self, name: str) -> bool:
@@ -174,28 +173,6 @@ class SelectionRound:
         best = [max(fits, key=lambda f: f.log_likelihood(ess), default=None) for fits in looks]
         work = [self._submit(h, ROUNDS, begun=b.values) if b else None for (h, _), b in zip(tried, best, strict=True)]
         return better(tried, [w.result() if w else f for (_, f), w in zip(tried, work, strict=True)])
-
-    def refitted_with_nominal(self, candidates: list[Hypothesis], tried: FittedHypotheses) -> FittedHypotheses:
-        """Identify effects of the drive together with the nominal model if nothing tried explains all.
-
-        Only for an uncalibrated rig with angle and command alone: a static curve and a lag absorb part of such effects.
-        """
-        if not self.chains.policy.wide_search or not angle_only(self.chains.recordings):
-            return tried
-        if any(mean_square(f, self.stage) < FORM_SHOWS for _, f in tried):
-            return tried
-
-        def go(h: Hypothesis) -> Fit:
-            begun = nominal_fit.fit_with_effect(self.chains.model, self.chains.recordings, h.own[0])
-            return self._fit(h, ROUNDS, 0, begun)
-
-        drive = [h for h in candidates if h.own[0].name in nominal_fit.SIZES]
-        best = dict(tried)
-        for h, f in zip(drive, self.pool.map(go, drive), strict=True):
-            ess = largest_ess([f, best.get(h, f)])
-            if h not in best or f.log_evidence(ess) > best[h].log_evidence(ess):
-                best[h] = f
-        return list(best.items())
 
     def ranked(self, tried: FittedHypotheses) -> Selection:
         """Log evidence of each over no further effect, and probabilities; the best first."""
@@ -262,6 +239,8 @@ class SelectionRound:
         steps, least = self.chains.policy.steps, self.chains.policy.least_ess
         if hypothesis.parameter and begun is None:  # it is fitted already: only its prior becomes wider
             begun = self.current.values
+        if begun is None and hypothesis.begun:
+            begun = {**self.current.values, **dict(hypothesis.begun)}
         if begun is None and CATALOGUE[hypothesis.effect].linear_in:
             first = fit(lambda values: residuals(from_linear(hypothesis.effect, values)),
                         [*known, *linear_parameters(hypothesis.effect)], rounds=3, least_ess=least)

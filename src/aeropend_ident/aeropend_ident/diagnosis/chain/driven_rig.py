@@ -1,0 +1,299 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nominal model of a driven rig whose angle and command alone were recorded.
+
+It holds what a careful person tries first: a static curve from duty to lift with a dead zone, the lag of the rotor,
+viscous damping and the zero of the angle; and, where a cross-validated free run needs them, dry friction, a transport
+delay and a second lag. Duty and time are first brought to units in which every rig resembles the same one, so that
+neither the scale of the duty nor that of time matters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
+from aeropend_ident.diagnosis.chain.priors import (
+    CHOSEN,
+    FINDINGS,
+    POWERS,
+    REFERENCE_GRAVITY,
+    nominal_parameters,
+    usual_size,
+)
+from aeropend_ident.diagnosis.chain.values import FILTER, of_rig, with_values
+from aeropend_ident.diagnosis.chain.weak_start import LAGS, WeakForm, downsampled, likeliest
+from aeropend_ident.diagnosis.document import Lift
+from aeropend_ident.diagnosis.policy import UNCALIBRATED
+from aeropend_ident.estimation.map_fit import ENOUGH, Fit, Search, Sensitivities, fit
+from aeropend_ident.estimation.parameter import key
+from aeropend_ident.signals.signals import Signals
+from aeropend_sim.model import actuator, dynamics
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import Model
+
+Array = NDArray[np.float64]
+
+OCTAVES = range(5, -6, -1)
+"""Powers of 2 of the time scales that are tried (choice: arms that swing with periods of 0.03 to 35 s)."""
+
+RESEMBLES = 1.0 / 3.0
+"""Gravity, over that of the bench, from which a rig resembles the bench in a time scale (choice: within an octave)."""
+
+LONGEST, SHORTEST = 16000, 200
+"""Samples of a recording in a time scale that is tried, at most and at least (choice: time, and some swings)."""
+
+NOTHING = 0.01
+"""Size of a term, in default sizes, below which it is absent (choice: far below what matters)."""
+
+FIRST_SIZE = 0.2
+"""Size, in default sizes, of the other terms from which their fit starts (choice)."""
+
+HORIZONS, FOLLOWED = (0.15, 0.35, 1.0), (6, 3, 2)
+"""Parts of the fitted data over which a fit is made one after the other, and fits that are followed after each.
+
+Choice: over a long horizon a poor start leads into a local minimum."""
+
+SHORTEST_HORIZON = 3.0
+"""[s] Shortest horizon for the arm of the bench (choice: some swings)."""
+
+STEPS, ROUNDS = 8, 3
+"""Steps and rounds of the fits; the last fit goes on to its end (choice)."""
+
+BLOCKS = 6
+"""Blocks of time of a cross-validation in each recording (choice: each holds some swings)."""
+
+MOST_STEPS, HALVINGS = 5, 4
+"""Steps of a fit without a block, and trials of a step, each half as long as the one before (choice)."""
+
+NEEDED = 1.05
+"""Squared error of prediction without a term, over that with it, above which the term stays (choice: 2.5 % in RMS)."""
+
+CURVE = 11
+"""Points of the static curve from duty to lift that is reported (choice).
+
+Measured: at ±30 % no verdict of 3 recordings changes (docs/results/thresholds.md)."""
+
+POWER_OF = {"mgd_over_J": -2, "c_over_J": -1, "L_over_J": -2, "J_m": 1, "L_a": 1}
+"""Parameter of the model -> power of time in its effect; those left out have none.
+
+Derived: the motor's time constants are J_m R_a / (K_e K_t) and L_a / R_a."""
+
+
+@dataclass(frozen=True)
+class Units:
+    """Factors on times and duties that make a rig resemble the bench's: period of the arm, largest duty 1."""
+
+    time: float
+    duty: float
+
+    def of(self, s: Signals) -> Signals:
+        """A recording in these units."""
+        return replace(s, period=self.time * s.period, duty=self.duty * s.duty)
+
+    def model(self, m: Model, *, back: bool = False) -> Model:
+        """A model in these units, or back in SI units."""
+        t, u = (1.0 / self.time, 1.0 / self.duty) if back else (self.time, self.duty)
+        numbers = {n: v * t ** POWER_OF.get(n, 0) for n, v in m.model.items()}
+        numbers["k2"] = m.model["k2"] / u
+        tau = key(FILTER).name
+        effects = {e: {n: v * t ** POWERS.get(CATALOGUE[e].parameters[n].unit, 0) for n, v in p.items()}
+                   if e in CATALOGUE else dict(p) for e, p in m.effects.items()}
+        return Model(m.name, numbers, {**m.sensing, tau: m.sensing[tau] * t}, effects)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A fitted nominal model: with which terms, where it ended, and its error of prediction by cross-validation."""
+
+    model: Model
+    fit: Fit
+    error: float
+
+
+def fit_driven_rig(model: Model, recordings: Sequence[Signals]) -> tuple[Model, list[Signals]]:
+    """Identify the nominal model from angle and command.
+
+    Args:
+        model: gives what the recordings cannot determine.
+        recordings: of one rig.
+
+    Returns:
+        The model, and the recordings with notes on it.
+    """
+    units = units_of(model, recordings)
+    scaled = [downsampled(units.of(s), dynamics.LONGEST_STEP) for s in recordings]
+    best = _searched(units.model(model), scaled, keep=model.effects)
+    best, notes = _chosen(best, scaled, keep=model.effects)
+    found = units.model(best.model, back=True)
+    f = fit_own(found, recordings)
+    return with_values(found, of_rig(f.values)), [s.noted(*notes) for s in recordings]
+
+
+def without_findings(model: Model, given: Model) -> tuple[Model, dict[str, float]]:
+    """The nominal model without dry friction, which is a finding as it is in a free decay, and the size that it has.
+
+    Args:
+        model: as identified.
+        given: the model before; what it holds is known to be there.
+    """
+    effects = {e: p for e, p in model.effects.items() if e not in FINDINGS or e in given.effects}
+    found = {f"{e}.{n}": v for e, p in model.effects.items() if e not in effects for n, v in p.items()}
+    return model.with_effects(effects), found
+
+
+def units_of(model: Model, recordings: Sequence[Signals]) -> Units:
+    """The units of a rig, from gravity by the weak form at the fastest time scale that resembles the bench's.
+
+    On a faster scale noise hides gravity, and it is found too small; on a slower one the arm only follows its duty.
+    """
+    duty = 1.0 / max(float(s.duty.max()) for s in recordings)
+    found = []
+    for octave in OCTAVES:
+        units = Units(2.0**octave, duty)
+        tried = [downsampled(units.of(s)) for s in recordings]
+        if not SHORTEST <= sum(map(len, tried)) <= LONGEST:
+            continue
+        likely = likeliest(model, tried, [WeakForm(s) for s in tried], few=True)
+        if likely:
+            gravity = likely[0].model.model["mgd_over_J"] / REFERENCE_GRAVITY
+            units = replace(units, time=units.time * math.sqrt(gravity))
+            if gravity >= RESEMBLES:
+                return units
+            found.append((-gravity, units.time))
+    return Units(min(found)[1] if found else 1.0, duty)
+
+
+def _searched(model: Model, recordings: Sequence[Signals], keep: Collection[str]) -> Candidate:
+    """The best fit with every term; fits start from each lag, with and without dry friction, over growing horizons."""
+    coarse = [downsampled(s) for s in recordings]
+    tests = [WeakForm(s) for s in coarse]
+    kinds = (False, True) if "coulomb_friction" not in keep else (False,)
+    starts = [likeliest(model, coarse, tests, friction=friction) for friction in kinds]
+    begun = [next(s.model for s in found if s.lag == lag) for found in starts for lag in LAGS
+             if any(s.lag == lag for s in found)] or [model]
+    for share, many in zip(HORIZONS, FOLLOWED, strict=True):
+        least = round(SHORTEST_HORIZON / recordings[0].period)
+        part = [replace(s, train=min(max(round(share * s.train), least), s.train)) for s in recordings]
+        fits = sorted((_fitted(m, part, 2, STEPS) for m in begun), key=lambda f: f[1].mean_square)
+        begun = [m for m, _ in fits[:many]]
+    full = [with_values(m, {n: _first_size(n, m) for n in CHOSEN if key(n).owner not in m.effects}) for m in begun]
+    m, f = min((_fitted(m, recordings, ROUNDS, STEPS) for m in full), key=lambda e: e[1].mean_square)
+    return Candidate(m, f, _error(m, recordings, f))
+
+
+def _first_size(name: str, m: Model) -> float:
+    """The size of a term from which a fit with every term starts."""
+    effect = key(name).owner
+    absent = CATALOGUE[effect].parameters[key(name).name].neutral
+    return absent + FIRST_SIZE * (usual_size(effect, m) - absent)
+
+
+def _absent(c: Candidate, name: str) -> bool:
+    """Whether a term has ended at the size at which it is absent."""
+    effect = key(name).owner
+    absent = CATALOGUE[effect].parameters[key(name).name].neutral
+    return abs(c.model.effect(effect, key(name).name) - absent) < NOTHING * abs(usual_size(effect, c.model) - absent)
+
+
+def _chosen(best: Candidate, recordings: Sequence[Signals], keep: Collection[str]) -> tuple[Candidate, list[str]]:
+    """Take out the terms that a cross-validated free run does not need, the least needed first."""
+    while True:
+        terms = [name for name in CHOSEN if key(name).owner in best.model.effects and key(name).owner not in keep]
+        gone = [name for name in terms if _absent(best, name)]
+        fewer = [_without(best, recordings, key(name).owner) for name in gone[:1] or terms]
+        simpler = min(fewer, key=lambda c: c.error, default=None)
+        if simpler is None or (simpler.error > NEEDED * best.error and not gone):
+            return best, []
+        best = simpler
+
+
+def _without(c: Candidate, recordings: Sequence[Signals], effect: str) -> Candidate:
+    model = c.model.with_effects({e: p for e, p in c.model.effects.items() if e != effect})
+    m, f = _fitted(model, recordings, ROUNDS, STEPS)
+    return Candidate(m, f, _error(m, recordings, f))
+
+
+def _fitted(model: Model, recordings: Sequence[Signals], rounds: int, steps: int) -> tuple[Model, Fit]:
+    f = fit_own(model, recordings, rounds, steps)
+    return with_values(model, of_rig(f.values)), f
+
+
+def fit_own(model: Model, recordings: Sequence[Signals], rounds: int = 10, steps: int = 4) -> Fit:
+    """Fit the parameters of a nominal model, with those of the effects that it holds."""
+    chains = CachedChains(model, recordings, UNCALIBRATED)
+    return fit(chains.residuals("arm"), nominal_parameters(chains, "arm"), rounds, steps, UNCALIBRATED.least_ess)
+
+
+def _error(model: Model, recordings: Sequence[Signals], f: Fit) -> float:
+    """Mean square of the free run in blocks of time that were left out of the fit: the geometric mean over the blocks.
+
+    So no block decides alone, such as the only one with a large step. Each fit starts from that of all blocks and keeps
+    its derivatives: it ends nearby, and one run a step is enough.
+    """
+    chains = CachedChains(model, recordings, UNCALIBRATED)
+    parameters = [replace(p, start=f.values[p.name]) for p in nominal_parameters(chains, "arm")]
+    search = Search(chains.residuals("arm"), parameters, UNCALIBRATED.least_ess)
+    slopes = search.jacobian()
+    information, _, _ = search.normal_equations(slopes)
+    errors = [_error_of_block(search, slopes, information, channel, block) for channel, s in slopes.items()
+              for block in np.array_split(np.arange(s.rows.shape[1]), BLOCKS)]
+    return float(np.exp(np.mean(np.log(errors))))
+
+
+def _error_of_block(search: Search, slopes: Mapping[str, Sensitivities], information: Array, channel: str,
+                    block: NDArray[np.intp]) -> float:
+    """Mean square in a block (M,) of a channel, at least that of noise, with parameters that are fitted to the rest."""
+    by, rows = slopes[channel].by, slopes[channel].rows[:, block]
+    without = information.copy()
+    without[np.ix_(by, by)] -= rows @ rows.T
+    z, now = search.z, search.current
+    cost = _cost_without(search, z, now, channel, block)
+    for _ in range(MOST_STEPS):
+        gradient = z.copy()
+        for k, s in slopes.items():
+            r = search.weight[k] * now[k]
+            if k == channel:
+                r[block] = 0.0
+            gradient[s.by] += s.rows @ r
+        step = -np.linalg.solve(without, gradient)
+        for _ in range(HALVINGS):
+            tried = np.clip(z + step, search.low, search.high)
+            there = search.at(tried)
+            new = _cost_without(search, tried, there, channel, block)
+            if new < cost:
+                break
+            step = 0.5 * step
+        else:
+            break
+        z, now, gained, cost = tried, there, cost - new, new
+        if gained < ENOUGH:
+            break
+    return max(float(np.mean(now[channel][block] ** 2)), 1.0)
+
+
+def _cost_without(search: Search, z: Array, residuals: Mapping[str, Array], channel: str, block: NDArray[np.intp]
+                  ) -> float:
+    own = search.weight[channel] * residuals[channel][block]
+    every = search.stack(residuals)
+    return float(every @ every - own @ own + z @ z)
+
+
+def lift(model: Model, recordings: Sequence[Signals]) -> Lift:
+    """The static lift of a duty and its lag: all that command and angle alone show of map, motor and thrust.
+
+    Args:
+        model: the identified model.
+        recordings: give the largest duty.
+    """
+    n = model.numbers()
+    duty = np.linspace(0.0, max(float(s.duty.max()) for s in recordings), CURVE)
+    speed = actuator.speed_at(n, actuator.voltage(n, duty))
+    middle = float(speed[CURVE // 2])
+    return Lift(duty=tuple(duty.tolist()), rad_per_s2=tuple((n["L_over_J"] * actuator.thrust(n, speed)).tolist()),
+                dead_zone=max(((n["k0"] / n["k1"]) ** 2 - n["k3"]) / n["k2"], 0.0) if n["k0"] < 0.0 else 0.0,
+                lag_s=n["J_m"] / (n["K_t"] * n["K_e"] / n["R_a"] + 2.0 * n["k_load"] * middle))

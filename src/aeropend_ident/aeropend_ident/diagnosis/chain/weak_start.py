@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Start values of a nominal model from a linear regression of the weak form.
+
+The equation of motion times a test function is integrated by parts, so that no reading is differentiated. There is one
+regression for each static curve and lag of a grid.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeropend_ident.signals.signals import Signals
+from aeropend_ident.signals.smoothing import block_mean
+from aeropend_sim.model import actuator, dynamics
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import Model
+
+Array = NDArray[np.float64]
+
+COARSE = 0.01
+"""[s] Sample period of the data that a search starts with (choice: far below the arm's time constants).
+
+Measured: at ±30 % no verdict of 3 recordings changes (docs/results/thresholds.md)."""
+
+TEST_FUNCTIONS = (0.25, 0.5)
+"""[s] Half-widths of the test functions of the weak form: a quarter and a half of a usual period of the arm."""
+
+LAGS = (0.04, 0.12, 0.4, 1.0)
+"""[s] Lags of the rotor that searches start from; each starts with the static curve that fits best with it (choice)."""
+
+DEAD_ZONES, BENDS, LOADS = (0.0, 0.08, 0.25), (0.003, 0.08, 0.6), (0.02, 1.0, 4.0)
+"""Static curves that searches start from: dead zone of the duty, k3/k2, and voltage of load over back-EMF (choice)."""
+
+MOVES = 0.8
+"""Share of a test function in which the arm must move to show its dry friction (choice)."""
+
+CLEAR, SLOW = 4.0, 0.02
+"""Rate of the arm that is motion: in standard deviations of its noise, and over that of fast motion (choice)."""
+
+HANGS = 0.1
+"""[rad] An arm that starts nearer to hanging than this is taken to start with a rotor that stands (choice).
+
+Measured: at ±30 % no verdict of 3 recordings changes (docs/results/thresholds.md)."""
+
+FULL = 2.3
+"""[V] Voltage at full duty of a rig without a measured voltage.
+
+Choice: only its product with other parameters acts.
+
+Measured: at ±30 % no verdict of 3 recordings changes (docs/results/thresholds.md)."""
+
+
+def downsampled(s: Signals, period: float = COARSE) -> Signals:
+    """The recording with block means in place of samples, at most so long a period [s] apart; angle and duty only."""
+    every = max(1, math.floor(period / s.period))
+    if every == 1:
+        return s
+    n = len(s) // every
+    empty = np.full(n, np.nan)
+    return replace(s, period=every * s.period, duty=block_mean(s.duty, every), theta=block_mean(s.theta, every),
+                   omega=empty, i_a=empty, v_a=empty, pulses=None, false_speed=np.zeros(n, dtype=bool),
+                   train=max(1, s.train // every))
+
+
+@dataclass(frozen=True)
+class Start:
+    """A start of a search: how much its regression leaves, the lag of its rotor [s], and the model."""
+
+    left: float
+    lag: float
+    model: Model
+
+
+def likeliest(model: Model, recordings: Sequence[Signals], tests: Sequence[WeakForm], *, few: bool = False,
+              friction: bool = False) -> list[Start]:
+    """Static curves and lags, the likeliest first.
+
+    Args:
+        model: gives the rest.
+        recordings: duty and angle.
+        tests: of the recordings.
+        few: only the first and last dead zone and bend, and the first load.
+        friction: with dry friction and the zero of the angle, from the stretches in which the arm moves.
+    """
+    found = []
+    grid = (DEAD_ZONES[::2], BENDS[::2], LOADS[:1], LAGS) if few else (DEAD_ZONES, BENDS, LOADS, LAGS)
+    for dead, bend, load, lag in product(*grid):
+        numbers = curve(model.model, dead, bend, load, lag)
+        m = replace(model, model=numbers)
+        r = regress(tests, [unit_lift(m, s) for s in recordings], friction=friction)
+        if r.gravity <= 0.5 or r.gain <= 0.0 or (friction and r.friction <= 0.0):
+            continue
+        numbers = {**numbers, "mgd_over_J": min(r.gravity, 5e3), "c_over_J": min(max(r.damping, 0.05), 100.0),
+                   "L_over_J": min(r.gain / numbers["k_thrust"], 1e5)}
+        effects = {**m.effects}
+        if friction:
+            bias = CATALOGUE["angle_offset"].parameters["bias"]
+            effects = {"coulomb_friction": {"accel": r.friction},
+                       "angle_offset": {"bias": min(max(r.zero, 0.5 * bias.low), 0.5 * bias.high)}, **effects}
+        found.append(Start(r.left, lag, replace(m, model=numbers, effects=effects)))
+    return sorted(found, key=lambda start: start.left)
+
+
+def curve(numbers: Mapping[str, float], dead: float, bend: float, load: float, lag: float) -> dict[str, float]:
+    """Parameters of a map and motor with a given static curve and lag.
+
+    Args:
+        numbers: the rest.
+        dead: duty below which the rotor stands.
+        bend: k3/k2; small: a root of the duty; large: a straight line.
+        load: ratio of the voltages for load and back-EMF at full duty.
+        lag: [s] of the rotor at full duty.
+    """
+    n = dict(numbers)
+    root = FULL / (math.sqrt(1.0 + bend) - math.sqrt(dead + bend))
+    n["k1"] = root / math.sqrt(n["k2"])
+    n["k3"] = bend * n["k2"]
+    n["k0"] = -root * math.sqrt(dead + bend)
+    top = FULL / n["K_e"] / (1.0 + load)
+    n["k_load"] = load * n["K_e"] * n["K_t"] / (n["R_a"] * top)
+    n["J_m"] = lag * (1.0 + 2.0 * load) * n["K_t"] * n["K_e"] / n["R_a"]
+    return n
+
+
+def unit_lift(model: Model, s: Signals) -> Array:
+    """Thrust (N,) over k_thrust for a duty: the speed squared, unless an effect of the thrust changes that."""
+    from scipy.signal import lfilter  # its import is slow
+
+    n = model.numbers()
+    hangs = abs(float(np.mean(s.theta[np.isfinite(s.theta)][:3]))) < HANGS
+    before = 0.0 if hangs else float(s.duty[0])
+    v = actuator.acting_voltage(n, s.duty, model.effects, s.period, before=before)
+    state = dynamics.State(omega=0.0 if hangs else float(actuator.speed_at(n, v[0])))
+    out = np.empty((3, len(v)))
+    dynamics.run_motor(v, state, *dynamics.prepare(model.with_effects({}), s.period), out)
+    pivot = dynamics.THRUST_PIVOT_SPEED
+    u = pivot**2 * (np.maximum(out[1], 0.0) / pivot) ** model.effect("thrust_exponent", "n")
+    tau = model.effect("thrust_lag", "tau")
+    keep = math.exp(-s.period / tau) if tau > 0.0 else 0.0
+    return lfilter([1.0 - keep], [1.0, -keep], u, zi=[keep * u[0]])[0] if keep else u
+
+
+class WeakForm:
+    """The weak form of θ̈ = -G sin(θ - θ0) - c θ̇ - f sign θ̇ + g u, for a linear regression of its coefficients.
+
+    With test functions φ: ∫ θ φ'' = ∫ (-G sin θ + G θ0 cos θ - f sign θ̇ + g u) φ + c ∫ θ φ' (D. Messenger and
+    D. Bortz, Multiscale Modeling & Simulation 19, 2021). `identification.weak` does the same for a library of terms;
+    here the input u is replaced for each curve that is tried while the other columns stay.
+
+    Args:
+        s: angle and duty of a recording.
+    """
+
+    def __init__(self, s: Signals) -> None:
+        known = np.flatnonzero(np.isfinite(s.theta))
+        theta = np.interp(np.arange(len(s)), known, s.theta[known])[:s.train]
+        sign = _direction(theta, s)
+        self.rows, self.kernels, left, moves = [], [], [], []
+        columns: list[list[Array]] = [[], [], [], []]
+        for half in TEST_FUNCTIONS:
+            width = max(round(half / s.period), 3)
+            z = np.arange(-width, width + 1) / width
+            bump = (1.0 - z * z) ** 4
+            first = -8.0 * z * (1.0 - z * z) ** 3
+            second = -8.0 * (1.0 - z * z) ** 3 + 48.0 * z * z * (1.0 - z * z) ** 2
+            h = width * s.period
+            rows = np.arange(width, len(theta) - width, max(width // 2, 1))
+            self.rows.append(rows)
+            self.kernels.append(bump)
+
+            def of(x: Array, kernel: Array, rows: NDArray[np.intp] = rows) -> Array:
+                return np.asarray(np.convolve(x, kernel[::-1], "same")[rows])
+
+            mean = of(theta, np.ones(2 * width + 1) / (2 * width + 1))  # φ'' integrates to 0
+            left.append(of(theta, second) / h**2 - mean * float(second.sum()) / h**2)
+            columns[0].append(-of(np.sin(theta), bump))
+            columns[1].append(of(theta, first) / h - mean * float(first.sum()) / h)
+            columns[2].append(of(np.cos(theta), bump))
+            columns[3].append(-of(sign, bump))
+            moves.append(of(np.abs(sign), bump) > MOVES * float(bump.sum()))
+        self.left = np.concatenate(left)
+        self.columns = [np.concatenate(c) for c in columns]
+        self.moves = np.concatenate(moves)
+
+    def of(self, u: Array) -> Array:
+        """∫ u φ for each test function (M,)."""
+        return np.concatenate([np.convolve(u, k[::-1], "same")[r] for r, k in zip(self.rows, self.kernels)])
+
+
+def _direction(theta: Array, s: Signals) -> Array:
+    """Direction (N,) in which the arm moves: 1, -1, or 0 where noise or rest hides it."""
+    from scipy.signal import savgol_filter  # its import is slow
+
+    width = 2 * max(round(TEST_FUNCTIONS[0] / 4.0 / s.period), 2) + 1
+    if len(theta) <= width:
+        return np.zeros(len(theta))
+    rate = savgol_filter(theta, width, 2, deriv=1, delta=s.period)
+    noise = s.sigma["theta"] * math.sqrt(12.0 / width) / (width * s.period)  # of the slope of a straight line
+    least = max(CLEAR * noise, SLOW * float(np.quantile(np.abs(rate), 0.95)))
+    return np.where(np.abs(rate) > least, np.sign(rate), 0.0)
+
+
+@dataclass(frozen=True)
+class Regression:
+    """What a regression of the weak form leaves (sum of squares), and its coefficients; the zero in rad."""
+
+    left: float
+    gravity: float
+    damping: float
+    gain: float
+    zero: float
+    friction: float
+
+
+def regress(tests: Sequence[WeakForm], lifts: Sequence[Array], *, friction: bool = False) -> Regression:
+    """Regress the weak form of several recordings.
+
+    Args:
+        tests: of the recordings.
+        lifts: (N,) each, the input.
+        friction: with dry friction, from the stretches in which the arm moves.
+    """
+    rows = [np.column_stack([*w.columns[:2], w.of(u), *w.columns[2:3 + friction]]) for w, u in zip(tests, lifts)]
+    kept = [w.moves if friction else np.ones(len(w.left), dtype=bool) for w in tests]
+    a = np.concatenate([x[k] for x, k in zip(rows, kept)])
+    b = np.concatenate([w.left[k] for w, k in zip(tests, kept)])
+    scale = np.maximum(np.linalg.norm(a, axis=0), 1e-300)
+    if len(b) < 2 * len(scale):
+        return Regression(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    x, *_ = np.linalg.lstsq(a / scale, b, rcond=1e-10)
+    gravity, damping, gain, bias, *dry = map(float, x / scale)
+    return Regression(float(np.sum((b - (a / scale) @ x) ** 2)), gravity, damping, gain,
+                      bias / gravity if gravity > 0.0 else 0.0, dry[0] if dry else 0.0)
