@@ -235,8 +235,12 @@ class Search:
             information, gradient, products = self.normal_equations(self.jacobian())
             cost = float(r @ r + self.z @ self.z)
             gained = 0.0
+            # a parameter that is pushed against its bound stays there, or the others would wait for its move
+            free = ~(((self.z <= self.low) & (gradient > 0.0)) | ((self.z >= self.high) & (gradient < 0.0)))
+            step = np.zeros(len(self.z))
+            reduced = information[np.ix_(free, free)]
             while damping < MOST_DAMPING:
-                step = np.linalg.solve(information + damping * np.diag(np.diag(information)), -gradient)
+                step[free] = np.linalg.solve(reduced + damping * np.diag(np.diag(reduced)), -gradient[free])
                 z = np.clip(self.z + step, self.low, self.high)
                 trial = self.at(z)
                 r = self.stack(trial)

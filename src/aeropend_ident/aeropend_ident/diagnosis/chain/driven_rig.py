@@ -260,7 +260,9 @@ def _error_of_block(search: Search, slopes: Mapping[str, Sensitivities], informa
             if k == channel:
                 r[block] = 0.0
             gradient[s.by] += s.rows @ r
-        step = -np.linalg.solve(without, gradient)
+        free = ~(((z <= search.low) & (gradient > 0.0)) | ((z >= search.high) & (gradient < 0.0)))
+        step = np.zeros(len(z))
+        step[free] = -np.linalg.solve(without[np.ix_(free, free)], gradient[free])
         for _ in range(HALVINGS):
             tried = np.clip(z + step, search.low, search.high)
             there = search.at(tried)

@@ -219,21 +219,28 @@ class Regression:
 
 
 def regress(tests: Sequence[WeakForm], lifts: Sequence[Array], *, friction: bool = False) -> Regression:
-    """Regress the weak form of several recordings.
+    """Regress the weak form of several recordings; each has a gain and a zero of its own, of which the means count.
 
     Args:
         tests: of the recordings.
         lifts: (N,) each, the input.
         friction: with dry friction, from the stretches in which the arm moves.
     """
-    rows = [np.column_stack([*w.columns[:2], w.of(u), *w.columns[2:3 + friction]]) for w, u in zip(tests, lifts)]
-    kept = [w.moves if friction else np.ones(len(w.left), dtype=bool) for w in tests]
-    a = np.concatenate([x[k] for x, k in zip(rows, kept)])
-    b = np.concatenate([w.left[k] for w, k in zip(tests, kept)])
+    many, every = len(tests), range(len(tests))
+    shared = 2 + friction
+    parts, left = [], []
+    for j, (w, u) in enumerate(zip(tests, lifts)):
+        kept = w.moves if friction else np.ones(len(w.left), dtype=bool)
+        nothing = np.zeros(len(w.left))
+        own = [x if k == j else nothing for x in (w.of(u), w.columns[2]) for k in every]
+        parts.append(np.column_stack([*w.columns[:2], *w.columns[3:3 + friction], *own])[kept])
+        left.append(w.left[kept])
+    a, b = np.concatenate(parts), np.concatenate(left)
     scale = np.maximum(np.linalg.norm(a, axis=0), 1e-300)
     if len(b) < 2 * len(scale):
         return Regression(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     x, *_ = np.linalg.lstsq(a / scale, b, rcond=1e-10)
-    gravity, damping, gain, bias, *dry = map(float, x / scale)
-    return Regression(float(np.sum((b - (a / scale) @ x) ** 2)), gravity, damping, gain,
-                      bias / gravity if gravity > 0.0 else 0.0, dry[0] if dry else 0.0)
+    x = x / scale
+    gravity, damping, gain, bias = float(x[0]), float(x[1]), float(np.mean(x[shared:-many])), float(np.mean(x[-many:]))
+    return Regression(float(np.sum((b - a @ x) ** 2)), gravity, damping, gain,
+                      bias / gravity if gravity > 0.0 else 0.0, float(x[2]) if friction else 0.0)
