@@ -21,7 +21,7 @@ from aeropend_ident.diagnosis import conclude, gap_share, regions, typed_json
 from aeropend_ident.diagnosis.chain import static_map
 from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
 from aeropend_ident.diagnosis.chain.chain import CutChains
-from aeropend_ident.diagnosis.chain.driven_rig import without_findings
+from aeropend_ident.diagnosis.chain.driven_rig import fit_driven_rig, without_findings
 from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model
 from aeropend_ident.diagnosis.chain.pwm_timing import with_pwm_timing
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, PLACE_OF_PARAMETER, neutral, of_rig, with_values
@@ -43,7 +43,7 @@ from aeropend_ident.diagnosis.free_run_gap import Gap, HeldOut, closure, gap
 from aeropend_ident.diagnosis.gap_budget import Repeats, budget
 from aeropend_ident.diagnosis.gap_share import MATERIAL_SHARE, Part
 from aeropend_ident.diagnosis.joint_fit import JointFit, fit_jointly
-from aeropend_ident.diagnosis.policy import GOOD_ENOUGH, policy_of
+from aeropend_ident.diagnosis.policy import GOOD_ENOUGH, angle_only, policy_of
 from aeropend_ident.diagnosis.search import gust, onset, speed_spikes, unknown_effect
 from aeropend_ident.diagnosis.search.findings import Findings
 from aeropend_ident.diagnosis.search.free_curves import MissingTerm, Repeatable
@@ -114,16 +114,20 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
         seconds: [s] that the search may take; None: a budget of simulations bounds it where it may be long.
     """
     with threadpool_limits(1):  # the matrices are narrow: threads of the linear algebra would slow each other down
-        likely: Mapping[str, float] = {}
+        policy = policy_of(recordings, fit_nominal=fit_nominal)
+        likely: dict[str, float] = {}
+        plain = None
         if fit_nominal:
             progress("identifying the nominal model", 0.0)
-            given = model
-            model, recordings = fit_nominal_model(given, recordings)
-            model, likely = without_findings(model, given)
-        policy = policy_of(recordings, fit_nominal=fit_nominal)
+        if policy.wide_search and angle_only(recordings):
+            rig = fit_driven_rig(model, recordings)
+            found, likely = without_findings(rig.model, model, recordings, material)
+            model, plain = replace(found, name=f"{model.name}, identified"), rig.plain
+        elif fit_nominal:
+            model, recordings = fit_nominal_model(model, recordings)
         kind = CutChains if policy.calibrated else CachedChains
         chains = with_pwm_timing(kind(model, recordings, policy))
-        chains.likely = likely
+        chains.likely, chains.plain = likely, plain
         return _diagnose(chains, Settings(jobs, material, seconds), progress)
 
 

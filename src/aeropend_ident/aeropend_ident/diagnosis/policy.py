@@ -104,7 +104,7 @@ CALIBRATED = Policy(
 numbers change none (docs/results/thresholds.md)."""
 
 UNCALIBRATED = Policy(
-    "uncalibrated rig", calibrated=False, driven=True, screening_rounds=1, steps=12, least_ess=100.0, budget=3500,
+    "uncalibrated rig", calibrated=False, driven=True, screening_rounds=1, steps=12, least_ess=100.0, budget=1500,
     noise_margin=0.75, undecided=0.01, unknown=UnknownLimits(0.2, 0.08, 0.08, 0.25, GOOD_ENOUGH**2))
 """Wider limits (choice): parameters in long valleys need more steps.
 

@@ -148,11 +148,13 @@ class Search:
         residuals: values by name -> residuals in units of a reading's noise.
         parameters: to be fitted.
         least_ess: effective sample size that a channel counts for at least.
+        holds: whether a parameter that is pushed against its bound is left out of a step.
     """
 
     def __init__(self, residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter],
-                 least_ess: float = 0.0) -> None:
+                 least_ess: float = 0.0, *, holds: bool = False) -> None:
         self.residuals, self.parameters, self.least_ess = residuals, tuple(parameters), least_ess
+        self.holds = holds
         self.low = np.array([p.to_standard(p.low) for p in parameters])
         self.high = np.array([p.to_standard(p.high) for p in parameters])
         self.z = np.array([p.to_standard(p.begin) for p in parameters])
@@ -219,6 +221,14 @@ class Search:
             products[k] = (s.by, of_all / self.weight[k] ** 2)
         return information, gradient, products
 
+    def free(self, z: Array, gradient: Array) -> NDArray[np.bool_]:
+        """Which parameters (P,) may move; with `holds`, not one that is pushed against its bound.
+
+        A step that is computed with its move and then clipped is wrong for all others.
+        """
+        pushed = ((z <= self.low) & (gradient > 0.0)) | ((z >= self.high) & (gradient < 0.0))
+        return ~pushed if self.holds else np.ones(len(z), dtype=bool)
+
     def improve(self, steps: int) -> tuple[Array, Products]:
         """Take Levenberg-Marquardt steps with the weights as they are.
 
@@ -235,8 +245,7 @@ class Search:
             information, gradient, products = self.normal_equations(self.jacobian())
             cost = float(r @ r + self.z @ self.z)
             gained = 0.0
-            # a parameter that is pushed against its bound stays there, or the others would wait for its move
-            free = ~(((self.z <= self.low) & (gradient > 0.0)) | ((self.z >= self.high) & (gradient < 0.0)))
+            free = self.free(self.z, gradient)
             step = np.zeros(len(self.z))
             reduced = information[np.ix_(free, free)]
             while damping < MOST_DAMPING:
@@ -257,7 +266,7 @@ class Search:
 
 
 def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter],
-        rounds: int = 10, steps: int = 4, least_ess: float = 0.0) -> Fit:
+        rounds: int = 10, steps: int = 4, least_ess: float = 0.0, *, holds: bool = False) -> Fit:
     """MAP fit with the noise inflated to the residual; see the module.
 
     Args:
@@ -267,8 +276,9 @@ def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence
         steps: Levenberg-Marquardt steps in each round.
         least_ess: effective sample size that a channel counts for at least during the search. A slow drift has a small
             one; with wide priors the search would then stay near their means.
+        holds: whether a parameter that is pushed against its bound is left out of a step: needed where many end there.
     """
-    search = Search(residuals, parameters, least_ess)
+    search = Search(residuals, parameters, least_ess, holds=holds)
     information, products = np.eye(len(search.z)), Products()
     for _ in range(rounds):
         information, products = search.improve(steps)

@@ -264,6 +264,7 @@ class CutChains:
     def __init__(self, model: Model, recordings: Sequence[Signals], policy: Policy = CALIBRATED) -> None:
         self.model, self.policy = model, policy
         self.likely: Mapping[str, float] = {}  # sizes of effects with which the parameters were identified
+        self.plain: Model | None = None  # the best nominal model without further terms, of a driven rig
         self.each = [self._cut(signals) for signals in recordings]
 
     def _cut(self, signals: Signals) -> CutChain:

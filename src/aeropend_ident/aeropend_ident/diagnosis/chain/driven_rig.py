@@ -26,7 +26,7 @@ from aeropend_ident.diagnosis.chain.priors import (
     usual_size,
 )
 from aeropend_ident.diagnosis.chain.values import FILTER, of_rig, with_values
-from aeropend_ident.diagnosis.chain.weak_start import LAGS, WeakForm, downsampled, likeliest
+from aeropend_ident.diagnosis.chain.weak_start import WeakForm, downsampled, likeliest
 from aeropend_ident.diagnosis.document import Lift
 from aeropend_ident.diagnosis.policy import UNCALIBRATED
 from aeropend_ident.estimation.map_fit import ENOUGH, Fit, Search, Sensitivities, fit
@@ -53,7 +53,7 @@ NOTHING = 0.01
 FIRST_SIZE = 0.2
 """Size, in default sizes, of the other terms from which their fit starts (choice)."""
 
-HORIZONS, FOLLOWED = (0.15, 0.35, 1.0), (6, 3, 2)
+HORIZONS, FOLLOWED = (0.15, 0.35, 1.0), (4, 4, 1)
 """Parts of the fitted data over which a fit is made one after the other, and fits that are followed after each.
 
 Choice: over a long horizon a poor start leads into a local minimum."""
@@ -115,35 +115,65 @@ class Candidate:
     error: float
 
 
-def fit_driven_rig(model: Model, recordings: Sequence[Signals]) -> tuple[Model, list[Signals]]:
+@dataclass(frozen=True)
+class DrivenRig:
+    """The nominal model as identified, and the best one without any of the terms of `CHOSEN`."""
+
+    model: Model
+    plain: Model
+
+
+def fit_driven_rig(model: Model, recordings: Sequence[Signals]) -> DrivenRig:
     """Identify the nominal model from angle and command.
 
     Args:
         model: gives what the recordings cannot determine.
         recordings: of one rig.
-
-    Returns:
-        The model, and the recordings with notes on it.
     """
     units = units_of(model, recordings)
     scaled = [downsampled(units.of(s), dynamics.LONGEST_STEP) for s in recordings]
-    best = _searched(units.model(model), scaled, keep=model.effects)
-    best, notes = _chosen(best, scaled, keep=model.effects)
-    found = units.model(best.model, back=True)
+    full, plain = _searched(units.model(model), scaled, keep=model.effects)
+    found = units.model(_chosen(full, scaled, keep=model.effects).model, back=True)
     f = fit_own(found, recordings)
-    return with_values(found, of_rig(f.values)), [s.noted(*notes) for s in recordings]
+    return DrivenRig(with_values(found, of_rig(f.values)), _rescaled(units.model(plain, back=True), found))
 
 
-def without_findings(model: Model, given: Model) -> tuple[Model, dict[str, float]]:
+def _rescaled(plain: Model, found: Model) -> Model:
+    """A model with the voltage scale of another: only products of that scale with other parameters act."""
+    a = found.model["k1"] / plain.model["k1"]
+    n = plain.model
+    return replace(plain, model={**n, "k1": a * n["k1"], "k0": a * n["k0"], "k_load": n["k_load"] / a,
+                                 "L_over_J": n["L_over_J"] / a**2})
+
+
+def without_findings(model: Model, given: Model, recordings: Sequence[Signals], material: float
+                     ) -> tuple[Model, dict[str, float]]:
     """The nominal model without dry friction, which is a finding as it is in a free decay, and the size that it has.
+
+    Dry friction that does not bring the model closer to the unseen part is no finding, but stays part of the model.
 
     Args:
         model: as identified.
         given: the model before; what it holds is known to be there.
+        recordings: of the rig.
+        material: share of the squared gap from which an effect is a finding.
     """
-    effects = {e: p for e, p in model.effects.items() if e not in FINDINGS or e in given.effects}
-    found = {f"{e}.{n}": v for e, p in model.effects.items() if e not in effects for n, v in p.items()}
-    return model.with_effects(effects), found
+    names = [e for e in FINDINGS if e in model.effects and e not in given.effects]
+    fewer = model.with_effects({e: p for e, p in model.effects.items() if e not in names})
+    if not names or _unseen(model, recordings) > (1.0 - material) * _unseen(fewer, recordings):
+        return model, {}
+    return fewer, {f"{e}.{n}": v for e in names for n, v in model.effects[e].items()}
+
+
+def _unseen(model: Model, recordings: Sequence[Signals]) -> float:
+    """Sum of squares, in units of a reading's noise, of free runs over the parts that nothing was fitted to."""
+    values = fit_own(model, recordings).values
+    chains = CachedChains(model, recordings, UNCALIBRATED)
+    total = 0.0
+    for k, (chain, s) in enumerate(zip(chains.each, recordings, strict=True)):
+        off = (chain.arm(chains.values_of(values, k)) - s.theta)[s.train:] / s.sigma["theta"]
+        total += float(np.nansum(off**2))
+    return total
 
 
 def units_of(model: Model, recordings: Sequence[Signals]) -> Units:
@@ -168,22 +198,35 @@ def units_of(model: Model, recordings: Sequence[Signals]) -> Units:
     return Units(min(found)[1] if found else 1.0, duty)
 
 
-def _searched(model: Model, recordings: Sequence[Signals], keep: Collection[str]) -> Candidate:
-    """The best fit with every term; fits start from each lag, with and without dry friction, over growing horizons."""
+def _searched(model: Model, recordings: Sequence[Signals], keep: Collection[str]) -> tuple[Candidate, Model]:
+    """The best fit with every term, and the best model without any.
+
+    Fits start from each lag, with and without dry friction, over growing horizons.
+    """
     coarse = [downsampled(s) for s in recordings]
     tests = [WeakForm(s) for s in coarse]
     kinds = (False, True) if "coulomb_friction" not in keep else (False,)
     starts = [likeliest(model, coarse, tests, friction=friction) for friction in kinds]
-    begun = [next(s.model for s in found if s.lag == lag) for found in starts for lag in LAGS
-             if any(s.lag == lag for s in found)] or [model]
+    begun = []
+    for found in starts:
+        best = {s.lag: s.model for s in reversed(found)}
+        if best:
+            begun.append(_over_growing_horizons(list(best.values()), recordings))
+    plain = _fitted(begun[0] if starts[0] else model, recordings, ROUNDS, STEPS)[0]
+    begun = [plain, *begun[1 if starts[0] else 0:]]
+    full = [with_values(m, {n: _first_size(n, m) for n in CHOSEN if key(n).owner not in m.effects}) for m in begun]
+    m, f = min((_fitted(m, recordings, ROUNDS, STEPS) for m in full), key=lambda e: e[1].mean_square)
+    return Candidate(m, f, _error(m, recordings, f)), plain
+
+
+def _over_growing_horizons(begun: list[Model], recordings: Sequence[Signals]) -> Model:
+    """The best of some starts after fits over the beginning, then over more and more of the recordings."""
     for share, many in zip(HORIZONS, FOLLOWED, strict=True):
         least = round(SHORTEST_HORIZON / recordings[0].period)
         part = [replace(s, train=min(max(round(share * s.train), least), s.train)) for s in recordings]
         fits = sorted((_fitted(m, part, 2, STEPS) for m in begun), key=lambda f: f[1].mean_square)
         begun = [m for m, _ in fits[:many]]
-    full = [with_values(m, {n: _first_size(n, m) for n in CHOSEN if key(n).owner not in m.effects}) for m in begun]
-    m, f = min((_fitted(m, recordings, ROUNDS, STEPS) for m in full), key=lambda e: e[1].mean_square)
-    return Candidate(m, f, _error(m, recordings, f))
+    return begun[0]
 
 
 def _first_size(name: str, m: Model) -> float:
@@ -200,7 +243,7 @@ def _absent(c: Candidate, name: str) -> bool:
     return abs(c.model.effect(effect, key(name).name) - absent) < NOTHING * abs(usual_size(effect, c.model) - absent)
 
 
-def _chosen(best: Candidate, recordings: Sequence[Signals], keep: Collection[str]) -> tuple[Candidate, list[str]]:
+def _chosen(best: Candidate, recordings: Sequence[Signals], keep: Collection[str]) -> Candidate:
     """Take out the terms that a cross-validated free run does not need, the least needed first."""
     while True:
         terms = [name for name in CHOSEN if key(name).owner in best.model.effects and key(name).owner not in keep]
@@ -208,7 +251,7 @@ def _chosen(best: Candidate, recordings: Sequence[Signals], keep: Collection[str
         fewer = [_without(best, recordings, key(name).owner) for name in gone[:1] or terms]
         simpler = min(fewer, key=lambda c: c.error, default=None)
         if simpler is None or (simpler.error > NEEDED * best.error and not gone):
-            return best, []
+            return best
         best = simpler
 
 
@@ -226,7 +269,8 @@ def _fitted(model: Model, recordings: Sequence[Signals], rounds: int, steps: int
 def fit_own(model: Model, recordings: Sequence[Signals], rounds: int = 10, steps: int = 4) -> Fit:
     """Fit the parameters of a nominal model, with those of the effects that it holds."""
     chains = CachedChains(model, recordings, UNCALIBRATED)
-    return fit(chains.residuals("arm"), nominal_parameters(chains, "arm"), rounds, steps, UNCALIBRATED.least_ess)
+    return fit(chains.residuals("arm"), nominal_parameters(chains, "arm"), rounds, steps, UNCALIBRATED.least_ess,
+               holds=True)
 
 
 def _error(model: Model, recordings: Sequence[Signals], f: Fit) -> float:
@@ -237,7 +281,7 @@ def _error(model: Model, recordings: Sequence[Signals], f: Fit) -> float:
     """
     chains = CachedChains(model, recordings, UNCALIBRATED)
     parameters = [replace(p, start=f.values[p.name]) for p in nominal_parameters(chains, "arm")]
-    search = Search(chains.residuals("arm"), parameters, UNCALIBRATED.least_ess)
+    search = Search(chains.residuals("arm"), parameters, UNCALIBRATED.least_ess, holds=True)
     slopes = search.jacobian()
     information, _, _ = search.normal_equations(slopes)
     errors = [_error_of_block(search, slopes, information, channel, block) for channel, s in slopes.items()
@@ -260,7 +304,7 @@ def _error_of_block(search: Search, slopes: Mapping[str, Sensitivities], informa
             if k == channel:
                 r[block] = 0.0
             gradient[s.by] += s.rows @ r
-        free = ~(((z <= search.low) & (gradient > 0.0)) | ((z >= search.high) & (gradient < 0.0)))
+        free = search.free(z, gradient)
         step = np.zeros(len(z))
         step[free] = -np.linalg.solve(without[np.ix_(free, free)], gradient[free])
         for _ in range(HALVINGS):

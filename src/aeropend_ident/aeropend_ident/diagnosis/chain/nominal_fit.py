@@ -96,8 +96,7 @@ def fit_nominal_model(model: Model, recordings: Sequence[Signals]) -> tuple[Mode
         noisier = [_with_local_noise(chain, chains.values_of(f.values, k)) for k, chain in enumerate(chains.each)]
         return replace(found, name=name), noisier
     if angle_only(recordings):
-        found, noted = fit_driven_rig(model, recordings)
-        return replace(found, name=name), noted
+        return replace(fit_driven_rig(model, recordings).model, name=name), list(recordings)
     return replace(_stage_by_stage(model, recordings, policy), name=name), list(recordings)
 
 

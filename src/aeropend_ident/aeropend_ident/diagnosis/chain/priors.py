@@ -181,6 +181,12 @@ def _of_angle(model: Model, recordings: Sequence[Signals]) -> list[Parameter]:
             replace(log("J_m", 0.7), low=quickest), _filter(model), *own]
 
 
+def absent(parameters: Sequence[Parameter]) -> dict[str, float]:
+    """The sizes at which effects among the parameters are absent, by name."""
+    names = [key(p.name) for p in parameters]
+    return {k.plain: CATALOGUE[k.owner].parameters[k.name].neutral for k in names if k.owner in CATALOGUE}
+
+
 def _of_effect(name: str, model: Model) -> Parameter:
     """The size of an effect that the nominal model holds."""
     size = CATALOGUE[key(name).owner].parameters[key(name).name]

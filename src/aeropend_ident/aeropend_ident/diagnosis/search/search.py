@@ -144,6 +144,8 @@ def _select(here: SelectionRound, findings: Findings, candidates: list[Hypothesi
     tried = here.converged(tried, rounds, but=lead)
     if not policy.wide_search and not any(passes_as_noise(f, MATERIAL) for _, f in tried):
         tried = here.multi_started(tried)
+    if not findings.found:
+        tried = here.from_plain(open_, tried)
     ranked = here.ranked(tried)
     # the parameters that the best hypothesis was led to may serve as well without it
     again = fit(chains.residuals(here.stage), started(here.known, ranked[0].fit.values))

@@ -4,7 +4,7 @@
 The order, as `search` calls it: `screened` (linear algebra leaves a shortlist, which is fitted for some rounds),
 `warm_started` (uncalibrated rigs: the best is fitted to its end, the others start again from its parameters),
 `converged` (the contenders are fitted to their end), `multi_started` (from their other start points),
-`ranked`.
+`from_plain` (driven rigs with the angle alone: from the nominal model without its further terms), `ranked`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
-from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD, nominal_parameters
+from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD, absent, nominal_parameters
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF
 from aeropend_ident.diagnosis.search.findings import RankedHypothesis, Selection, adopted
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
@@ -173,6 +173,26 @@ class SelectionRound:
         best = [max(fits, key=lambda f: f.log_likelihood(ess), default=None) for fits in looks]
         work = [self._submit(h, ROUNDS, begun=b.values) if b else None for (h, _), b in zip(tried, best, strict=True)]
         return better(tried, [w.result() if w else f for (_, f), w in zip(tried, work, strict=True)])
+
+    def from_plain(self, candidates: list[Hypothesis], tried: FittedHypotheses) -> FittedHypotheses:
+        """Fit from the nominal model without its further terms, if nothing tried explains all.
+
+        Of a rig with angle and command alone such terms may stand in for an effect; no step leads back from there.
+        """
+        plain, chains = self.chains.plain, self.chains
+        late = self.deadline is not None and self.budget_spent
+        if plain is None or late or any(mean_square(f, self.stage) < FORM_SHOWS for _, f in tried):
+            return tried
+        there = type(chains)(plain, chains.recordings, chains.policy)
+        known = nominal_parameters(there, self.stage)
+        base = fit(there.residuals(self.stage), known, least_ess=chains.policy.least_ess, holds=True)
+        here = replace(self, chains=there, known=known, current=base)
+        lead, best = min(here.converged(here.screened(candidates)), key=lambda item: item[1].mean_square)
+        if best.mean_square > min(f.mean_square for _, f in tried):
+            return tried
+        ended = self._fit(lead, ROUNDS, 0, {**absent(self.known), **best.values})
+        return [(h, f) for h, f in tried if h.name != lead.name] + better(
+            [(lead, ended)], [f for h, f in tried if h.name == lead.name] or [ended])
 
     def ranked(self, tried: FittedHypotheses) -> Selection:
         """Log evidence of each over no further effect, and probabilities; the best first."""
