@@ -19,7 +19,7 @@ ifneq ($(CURDIR)$(PYTHON),$(shell cat .venv/.tree 2>/dev/null))
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test bench blind sensitivity regression soak coverage lint clean distclean
+.PHONY: help demo test bench blind real sensitivity regression soak coverage lint clean distclean
 
 help: ## show this
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile | expand -t 20
@@ -44,6 +44,9 @@ bench: .venv/.dev ## measure speed beside C, scipy, pysindy and rosbags (ARGS=--
 
 blind: .venv/.dev ## diagnose recordings of withheld effects, then open their labels (ARGS="--count 60 --seed 7")
 	$(BIN)/python -m evaluation.blind $(ARGS)
+
+real: .venv/.dev ## diagnose recordings of real rigs beside a grey box (DATA=folder with rigs.csv, ARGS="--only a b")
+	$(BIN)/python -m evaluation.real $(DATA) $(ARGS)
 
 sensitivity: .venv/.dev ## diagnose with each decision threshold at 70 and 130 % (ARGS="--minutes 20"; ARGS=--docs)
 	$(BIN)/python -m evaluation.sensitivity $(ARGS)

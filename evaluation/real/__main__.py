@@ -36,6 +36,9 @@ from aeropend_sim.model.parameters import load
 from evaluation.blind.page import markdown
 from evaluation.real import grey_box
 
+FLAT = -1e5
+"""[%] Fit below which the angle counts as flat: no model has a fit there (choice)."""
+
 COLUMNS = ("name", "rig", "file", "options", "known")
 
 
@@ -63,6 +66,7 @@ class Row:
         verdict: effects claimed with their shares, or why there is no verdict.
         effects: ids of the effects claimed.
         seconds: that the diagnosis took.
+        own: ids of effects that the identified nominal model holds.
     """
 
     name: str
@@ -73,6 +77,7 @@ class Row:
     verdict: str
     effects: tuple[str, ...]
     seconds: float
+    own: tuple[str, ...] = ()
 
 
 def rigs_of(folder: Path) -> list[Rig]:
@@ -117,7 +122,8 @@ def row(rig: Rig, folder: Path, out: Path, *, peer: bool, jobs: int) -> Row:
                                  signals.train).theta)
     fitted, unseen = _fits(runs, signals)
     which = found.conclusions.which
-    return Row(rig.name, rig.rig, rig.known, fitted, unseen, _said(found), tuple(which.effects), seconds)
+    return Row(rig.name, rig.rig, rig.known, fitted, unseen, _said(found), tuple(which.effects), seconds,
+               tuple(found.model.effects))
 
 
 def _fits(runs: Sequence[np.ndarray], signals: Signals) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -135,27 +141,29 @@ def _said(found: Diagnosis) -> str:
 
 
 def contradicted(rows: Sequence[Row]) -> dict[str, list[str]]:
-    """Name -> effects claimed that another recording of the same rig does not show."""
+    """Name -> effects claimed that another recording of the same rig shows neither as a claim nor in its own model."""
     out = {}
     for r in rows:
-        others = [set(o.effects) for o in rows if o.rig == r.rig and o is not r and o.fitted]
+        others = [{*o.effects, *o.own} for o in rows if o.rig == r.rig and o is not r and o.fitted]
         out[r.name] = [e for e in r.effects if others and not all(e in o for o in others)]
     return out
 
 
 def table(rows: Sequence[Row]) -> list[str]:
     """The rows as a Markdown table."""
-    lines = [["recording", "fitted part: nominal, augmented, grey box", "unseen part", "verdict", "time"]]
+    lines = [["recording", "fitted part: nominal, augmented, grey box", "unseen part", "verdict", "own model holds",
+              "time"]]
     contradictions = contradicted(rows)
     for r in rows:
         said = r.verdict + (f"; not in another recording: {', '.join(contradictions[r.name])}"
                             if contradictions[r.name] else "")
-        lines.append([r.name, _percents(r.fitted), _percents(r.unseen), said, f"{r.seconds:.1f} s"])
+        lines.append([r.name, _percents(r.fitted), _percents(r.unseen), said, ", ".join(r.own),
+                      f"{r.seconds:.1f} s"])
     return markdown(lines)
 
 
 def _percents(fits: Sequence[float]) -> str:
-    return ", ".join(f"{max(f, -999.0):.0f} %" for f in fits)
+    return ", ".join(f"{f:.0f} %" if f > FLAT else "at rest" for f in fits)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 from aeropend_ident.diagnosis import experiment_design
 from aeropend_ident.diagnosis.chain import driven_rig
 from aeropend_ident.diagnosis.chain.chain import CutChains
-from aeropend_ident.diagnosis.chain.priors import OF_THE_ARM, UNCALIBRATED_SD, ZERO, basis, model_parameters
+from aeropend_ident.diagnosis.chain.priors import CHOSEN, OF_THE_ARM, UNCALIBRATED_SD, ZERO, basis, model_parameters
 from aeropend_ident.diagnosis.chain.values import FILTER, STAGES, neutral, of_rig, with_values
 from aeropend_ident.diagnosis.document import (
     Candidate,
@@ -133,7 +133,9 @@ def identified_model(chains: CutChains, joint: JointFit, rows: Mapping[str, Para
         mean = one if own is None else own.mean
         hangs = HangingAngle(mean.value, mean.low, mean.high, own.runs if own else None,
                              own.run_to_run if own else None)
-    return Identified(basis(recordings), tuple(n for n, row in rows.items() if not row.determined), lift, hangs)
+    terms = [n for n in CHOSEN if n in values and n != ZERO and key(n).owner in chains.model.effects and lift]
+    return Identified(basis(recordings), tuple(n for n, row in rows.items() if not row.determined), lift, hangs,
+                      {n: _interval(values[n], joint.sd[n]) for n in terms})
 
 
 def candidates(joint: JointFit, statistical: Statistical, held_out: HeldOut, gap_after: float,

@@ -21,7 +21,7 @@ from aeropend_ident.diagnosis import conclude, gap_share, regions, typed_json
 from aeropend_ident.diagnosis.chain import static_map
 from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
 from aeropend_ident.diagnosis.chain.chain import CutChains
-from aeropend_ident.diagnosis.chain.driven_rig import fit_driven_rig, without_findings
+from aeropend_ident.diagnosis.chain.driven_rig import fit_driven_rig, fit_own, without_findings
 from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model
 from aeropend_ident.diagnosis.chain.pwm_timing import with_pwm_timing
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, PLACE_OF_PARAMETER, neutral, of_rig, with_values
@@ -306,7 +306,10 @@ def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Finding
     chains, recordings = fitted, fitted.recordings
     if fitted.policy.wide_search:
         stages = unsearched(fitted)
-        if failed := static_map.why_not_identified(recordings, stages["arm"].base.residuals):
+        left = stages["arm"].base.residuals
+        if fitted.likely:  # the model was identified with dry friction, which the search has still to find
+            left = fit_own(with_values(fitted.model, fitted.likely), recordings).residuals
+        if failed := static_map.why_not_identified(recordings, left):
             return _Findings(fitted, stages, Statistical(None, None), None, regions.largest_misfit(fitted, stages),
                              recordings, failed)
     if not fitted.policy.driven:  # a decay has few swings: effects are selected on all of them

@@ -377,12 +377,14 @@ class Identified:
         not_determined: parameters that the recordings do not determine.
         lift: only where duty and angle are all that was measured.
         hangs_at: only where it was fitted.
+        own: effects that the nominal model holds since a cross-validated free run needs them: name -> size.
     """
 
     basis: str = field(metadata={"key": "from"})
     not_determined: tuple[str, ...]
     lift: Lift | None = None
     hangs_at: HangingAngle | None = None
+    own: Mapping[str, Interval] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -152,6 +152,7 @@ def identified_line(identified: Identified, rows: Mapping[str, ParameterRow]) ->
     if hangs := identified.hangs_at:
         texts.append(f"hangs at {hangs.value:.3g} rad"
                      + (f" (run to run {hangs.run_to_run:.2g})" if hangs.run_to_run else ""))
+    texts += [f"{n} = {size.value:.3g} ({size.low:.3g} to {size.high:.3g})" for n, size in identified.own.items()]
     if lift := identified.lift:
         texts.append(f"lift up to {lift.rad_per_s2[-1]:.3g} rad/s² at a duty of {lift.duty[-1]:.2f}, none below "
                      f"{lift.dead_zone:.2g}, with a lag of {lift.lag_s:.2g} s")

@@ -340,6 +340,8 @@ def lift(model: Model, recordings: Sequence[Signals]) -> Lift:
     duty = np.linspace(0.0, max(float(s.duty.max()) for s in recordings), CURVE)
     speed = actuator.speed_at(n, actuator.voltage(n, duty))
     middle = float(speed[CURVE // 2])
-    return Lift(duty=tuple(duty.tolist()), rad_per_s2=tuple((n["L_over_J"] * actuator.thrust(n, speed)).tolist()),
+    pivot = dynamics.THRUST_PIVOT_SPEED
+    thrust = n["k_thrust"] * pivot**2 * (np.maximum(speed, 0.0) / pivot) ** model.effect("thrust_exponent", "n")
+    return Lift(duty=tuple(duty.tolist()), rad_per_s2=tuple((n["L_over_J"] * thrust).tolist()),
                 dead_zone=max(((n["k0"] / n["k1"]) ** 2 - n["k3"]) / n["k2"], 0.0) if n["k0"] < 0.0 else 0.0,
                 lag_s=n["J_m"] / (n["K_t"] * n["K_e"] / n["R_a"] + 2.0 * n["k_load"] * middle))

@@ -64,6 +64,9 @@ Measured: at ±30 % no verdict of 3 recordings changes (docs/results/thresholds.
 POWERS = {"s": 1, "1/s": -1, "rad/s": -1, "rad/s²": -2, "1/s²": -2}
 """Unit -> power of time in it (derived)."""
 
+LEAST_VOLTAGE = 1e-3
+"""[V] Voltage at the largest duty that a bound of the load is computed for at least (choice: far below any)."""
+
 STRAIGHT = 2.0
 """Largest ratio k3/k2 (derived: the formula for the voltage is then straight to 3 % of its range)."""
 
@@ -172,7 +175,7 @@ def _of_angle(model: Model, recordings: Sequence[Signals]) -> list[Parameter]:
     if free_swinging(recordings):
         return [*arm, Parameter(ZERO, model.effect("angle_offset", "bias"), 0.3)]
     own = [_of_effect(name, model) for name in CHOSEN if key(name).owner in model.effects]
-    full = float(actuator.voltage(m, max(float(s.duty.max()) for s in recordings)))
+    full = max(float(actuator.voltage(m, max(float(s.duty.max()) for s in recordings))), LEAST_VOLTAGE)
     heaviest = HEAVIEST * (1.0 + HEAVIEST) * m["K_e"] ** 2 * m["K_t"] / (m["R_a"] * full)
     quickest = max(QUICKEST * slower, 0.6 * max(s.period for s in recordings)) * m["K_t"] * m["K_e"] / m["R_a"]
     rest = -m["k1"] * math.sqrt(m["k3"])  # a duty of 0 does not turn the rotor

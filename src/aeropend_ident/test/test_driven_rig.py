@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nominal model of a driven rig with angle and command alone, in the rig's own units."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from aeropend_ident.diagnosis.chain.driven_rig import Units, fit_driven_rig, fit_own, units_of
+from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.signals.from_bag import end_of_motion
+from aeropend_ident.signals.signals import Signals, from_arrays
+from aeropend_ident.testing.rigs import BENCH
+from aeropend_sim.model import dynamics
+from aeropend_sim.model.parameters import Model
+
+PERIOD, NOISE = 0.01, 0.001
+
+
+def driven(numbers=None, effects=None, seconds=25.0, hold=(0.5, 3.0), seed=0, sign=1.0, zero=0.0) -> Signals:
+    """Angle and command of a rig that steps of the duty drive."""
+    rng = np.random.default_rng(seed)
+    model = Model("rig", {**BENCH.model, **(numbers or {})}, BENCH.sensing, effects or {})
+    duty = np.zeros(round(seconds / PERIOD))
+    k = round(hold[0] / PERIOD)
+    while k < len(duty):
+        n = round(rng.uniform(*hold) / PERIOD)
+        duty[k:k + n] = rng.choice([0.0, 1.0], p=[0.2, 0.8]) * rng.uniform(0.1, 0.5)
+        k += n
+    theta = dynamics.simulate(model, duty, PERIOD).theta + zero + NOISE * rng.standard_normal(len(duty))
+    nothing = np.full(len(duty), np.nan)
+    sensing = {**BENCH.sensing, "angle_lsb": 0.0}
+    return from_arrays({"theta": sign * theta, "omega": nothing, "i_a": nothing, "v_a": nothing, "duty": duty}, PERIOD,
+                       sensing)
+
+
+def test_a_model_comes_back_from_other_units_as_it_was():
+    units = Units(3.0, 0.4)
+    model = BENCH.with_effects({"coulomb_friction": {"accel": 0.8}, "command_delay": {"delay": 0.03}})
+    back = units.model(units.model(model), back=True)
+    assert back.model == pytest.approx(model.model)
+    assert {e: dict(p) for e, p in back.effects.items()} == {
+        "coulomb_friction": pytest.approx({"accel": 0.8}), "command_delay": pytest.approx({"delay": 0.03})}
+
+
+@pytest.mark.promise("Uncalibrated rigs", "The scale of the duty column and that of time do not change what is found")
+@pytest.mark.parametrize(("time", "duty"), [(4.0, 0.1), (0.25, 1.8)])
+def test_the_scale_of_duty_and_time_changes_the_units_alone(time, duty):
+    s = driven(effects={"coulomb_friction": {"accel": 0.8}})
+    other = replace(s, period=time * s.period, duty=duty * s.duty)
+    one, two = (fit_driven_rig(BENCH, [x]).model for x in (s, other))
+    assert two.model["mgd_over_J"] * time**2 == pytest.approx(one.model["mgd_over_J"], rel=0.03)
+    assert two.model["c_over_J"] * time == pytest.approx(one.model["c_over_J"], rel=0.06)
+    assert two.effect("coulomb_friction", "accel") * time**2 == pytest.approx(0.8, rel=0.05)
+    assert units_of(BENCH, [other]).time * time == pytest.approx(units_of(BENCH, [s]).time, rel=0.3)
+
+
+@pytest.mark.promise("Uncalibrated rigs", "Dry friction of a slow rig is found within some percent")
+@pytest.mark.parametrize(("gravity", "friction"), [(1.7, 0.03), (4.3, 0.05)])
+def test_dry_friction_of_a_slow_rig_is_found(gravity, friction):
+    numbers = {"mgd_over_J": gravity, "c_over_J": 0.2, "L_over_J": BENCH.model["L_over_J"] * gravity / 33.8}
+    s = driven(numbers, {"coulomb_friction": {"accel": friction}}, seconds=90.0, hold=(2.0, 9.0))
+    found = diagnose(BENCH, [s], 2, fit_nominal=True)
+    assert found.body["which"]["effects"] == ["coulomb_friction"]
+    assert found.augmented.effect("coulomb_friction", "accel") == pytest.approx(friction, rel=0.05)
+    assert found.augmented.model["mgd_over_J"] == pytest.approx(gravity, rel=0.02)
+
+
+@pytest.mark.promise("Uncalibrated rigs", "Delay and zero of a rig are its own model and no effect")
+def test_delay_and_zero_are_the_rigs_own():
+    s = driven({}, {"command_delay": {"delay": 0.1}}, zero=0.08)
+    body = diagnose(BENCH, [s], 2, fit_nominal=True).body
+    assert body["which"]["verdict"] == "none"
+    assert body["identified"]["own"]["command_delay.delay"]["value"] == pytest.approx(0.1, abs=0.02)
+    assert body["identified"]["hangs_at"]["value"] == pytest.approx(0.08, abs=0.005)
+
+
+def test_a_term_that_the_free_run_does_not_need_is_left_out():
+    found = fit_driven_rig(BENCH, [driven()]).model
+    assert "coulomb_friction" not in found.effects
+    assert fit_own(found, [driven()]).mean_square < 1.2
+
+
+@pytest.mark.promise("Uncalibrated rigs", "An angle of the wrong sign gives no verdict, and the reason")
+def test_an_angle_that_falls_while_the_duty_lifts_gives_no_effect():
+    body = diagnose(BENCH, [driven(sign=-1.0)], 2, fit_nominal=True).body
+    assert body["which"]["verdict"] == "cannot_tell"
+    assert body["which"]["effects"] == []
+    assert "sign" in body["which"]["unexplained"][0]
+
+
+def test_a_rest_at_the_end_is_left_out_and_one_between_is_not():
+    duty = np.repeat([0.0, 0.4, 0.0], [100, 400, 500])
+    theta = np.where(duty > 0.0, 0.5, 0.0) + 0.001 * np.random.default_rng(0).standard_normal(1000)
+    assert end_of_motion(theta, duty, 0.001, 0.3) == pytest.approx(525, abs=2)
+    assert end_of_motion(theta[:560], duty[:560], 0.001, 0.3) == 0
+    assert end_of_motion(np.roll(theta, 400), np.roll(duty, 400), 0.001, 0.3) == 0
