@@ -14,9 +14,13 @@ from aeropend_ident.diagnosis import joint_fit, policy
 from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model
+from aeropend_ident.diagnosis.conclude import next_experiment
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.experiment_design import experiments_within
+from aeropend_ident.diagnosis.search.findings import RankedHypothesis
+from aeropend_ident.diagnosis.search.hypotheses import hypotheses
 from aeropend_ident.diagnosis.validation import validate
+from aeropend_ident.estimation.map_fit import estimate
 from aeropend_ident.signals.free_decay import free_swings
 from aeropend_ident.signals.from_bag import from_uncalibrated
 from aeropend_ident.signals.grid import irregular_grid
@@ -307,11 +311,13 @@ def test_what_the_nominal_model_can_take_is_not_claimed(effect, size):
 
 
 @pytest.mark.promise("Uncalibrated rigs", "The advised experiment does not exceed the duty that the rig has had")
-def test_the_experiment_advised_asks_for_no_more_duty_than_there_was(monkeypatch):
-    monkeypatch.setattr(policy, "UNCALIBRATED", replace(policy.UNCALIBRATED, undecided=0.0))  # every rival is open
-    _, read = unknown(3, {"coulomb_friction": {"accel": 0.8}})
-    advised = verdict(from_uncalibrated(read, BENCH.sensing))["which"]["next_experiment"]["excite"]
-    assert 0.0 < Excitation(**advised).series().max() <= np.max(read.duty)
+def test_the_experiment_advised_asks_for_no_more_duty_than_there_was():
+    _, read = unknown(6)
+    signals, most = from_uncalibrated(read, BENCH.sensing), float(np.max(read.duty))
+    rivals = [RankedHypothesis(h, estimate({h.own[0].name: size}, {}), 0.0, 0.5) for h in hypotheses(BENCH)
+              for effect, size in (("coulomb_friction", 0.8), ("quadratic_drag", 0.6)) if h.effect == effect]
+    advised = next_experiment(BENCH, signals, [(rivals[0], rivals[1])], {}, experiments_within(most))
+    assert 0.0 < Excitation(**advised.excite).series().max() <= most
 
 
 @pytest.mark.parametrize("top", [0.003, 0.264, 1.0])
