@@ -61,7 +61,8 @@ def unusual():
                                                          "sequence": [0.0, 0.4, 1]}}}
     identified = {"from": "the angle and the command", "not_determined": ["R_a"],
                   "lift": {"duty": [0.0, 1.0], "rad_per_s2": [0.0, 9.5], "dead_zone": 0.1, "lag_s": 0.2},
-                  "hangs_at": {**interval, "runs": [interval], "run_to_run": 0.0}}
+                  "hangs_at": {**interval, "runs": [interval], "run_to_run": 0.0},
+                  "own": {"command_delay.delay": interval}}
     order = list(made)
     order.insert(order.index("shrink") + 1, "identified")
     made |= {"which": which, "identified": identified}
