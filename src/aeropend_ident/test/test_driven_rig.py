@@ -89,6 +89,17 @@ def test_an_angle_that_falls_while_the_duty_lifts_gives_no_effect():
     assert "sign" in body["which"]["unexplained"][0]
 
 
+@pytest.mark.promise("Uncalibrated rigs", "A model that does not predict the unseen part names no effect")
+def test_no_effect_is_named_where_the_unseen_part_is_not_predicted():
+    s = driven(effects={"coulomb_friction": {"accel": 0.8}})
+    other = s.theta.copy()
+    other[s.train:] = 2.0 * np.mean(other[s.train:]) - other[s.train:]
+    body = diagnose(BENCH, [replace(s, theta=other)], 2, fit_nominal=True).body
+    assert (body["which"]["verdict"], body["which"]["effects"]) == ("cannot_tell", [])
+    assert "does not predict the rig" in body["which"]["unexplained"][0]
+    assert not any(c["found"] for c in body["which"]["candidates"])
+
+
 def test_a_rest_at_the_end_is_left_out_and_one_between_is_not():
     duty = np.repeat([0.0, 0.4, 0.0], [100, 400, 500])
     theta = np.where(duty > 0.0, 0.5, 0.0) + 0.001 * np.random.default_rng(0).standard_normal(1000)

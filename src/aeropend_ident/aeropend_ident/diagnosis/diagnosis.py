@@ -358,13 +358,14 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
     calibrated = chains.policy.calibrated
     share = gap_share.shares(parts)
     head = gap_share.headline(parts, share, settings.material)
-    if found.failed:
-        head = replace(head, verdict=CANNOT_TELL, place="none")
+    failed = found.failed or _why_not_predicted(chains, gaps)
+    if failed:
+        head = gap_share.Headline(CANNOT_TELL, "none", [], [], set())
     candidates = conclude.candidates(joint, found.statistical, gaps.held_out, gaps.after.total, head.claimed, share,
                                      found.onset)
     reasons = [f"{c} is off by {x:.1f} times a reading's noise"
                for c, x in _left(stages, gust=found.statistical.gust is not None).items() if x > GOOD_ENOUGH]
-    reasons = [found.failed] if found.failed else reasons
+    reasons = [failed] if failed else reasons
     undecided = conclude.not_separable(stages, chains.policy.undecided)
     tried = EXPERIMENTS if calibrated else experiments_within(max(float(s.duty.max()) for s in found.recordings))
     rows = conclude.parameter_rows(chains, joint)
@@ -384,6 +385,18 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
         closure=Closure(gaps.before.total, gaps.after.total, gaps.before.total_floor(gaps.floors), closed, low, high,
                         budget=gaps.budget(gust=found.statistical.gust is not None)),
         identified=None if calibrated else conclude.identified_model(chains, joint, rows))
+
+
+def _why_not_predicted(chains: CutChains, gaps: _Gaps) -> str:
+    """Why a model that was identified predicts nothing that it was not fitted to; "" if it predicts something."""
+    if not chains.policy.wide_search or "theta" not in gaps.after.rms:
+        return ""
+    fitted, unseen = gaps.fits("theta")
+    if unseen >= 0.0:
+        return ""
+    return ("the model that was identified does not predict the rig: the fit of its free run is "
+            f"{fitted:.0%} on the part that was fitted and {unseen:.0%} on the unseen one, where a constant angle has "
+            "0 %; a longer recording whose last third repeats angles and duties of the part before helps most")
 
 
 def _curves(term: MissingTerm) -> DrawnEffect:
