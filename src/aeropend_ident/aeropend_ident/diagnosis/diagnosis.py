@@ -228,7 +228,8 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
         found = replace(found, unknown=None)
         parts = _parts(found, joint, gaps, settings.jobs)
     if found.unknown is not None and _approximated(found.unknown, joint, gaps, parts):
-        stages = {b: f.nothing() if b in found.unknown.instead else f for b, f in found.stages.items()}
+        stage = found.unknown.stage
+        stages = {**found.stages, stage: found.stages[stage].nothing()}
         found, joint, gaps = _fit_and_measure(fitted, replace(found, stages=stages), progress)
         parts = _parts(found, joint, gaps, settings.jobs)
     conclusions = _conclude(found, joint, gaps, parts, settings)
@@ -291,8 +292,8 @@ def _repeats(parts: Sequence[Part], material: float) -> bool:
 
 def _approximated(unknown: UnknownEffect, joint: JointFit, gaps: _Gaps, parts: Sequence[Part]) -> bool:
     """Whether effects found only approximate an unknown one whose part of the gap, theirs included, is the largest."""
-    effects = [h for b in unknown.instead for h in joint.findings[b].effects]
-    if not effects:
+    effects = joint.findings[unknown.stage].effects
+    if not unknown.instead or not effects:
         return False
     theirs = gap_share.part_of_several(effects, joint, gaps.held_out.in_motion(), unknown.term.place)
     names = {h.name for h in effects}

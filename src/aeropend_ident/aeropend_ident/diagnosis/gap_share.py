@@ -37,6 +37,11 @@ MATERIAL_SHARE = 0.03
 
 Choice: without an effect of this share the gap (RMS) grows by 1.5 %, which changes nothing that a model is used for."""
 
+SURELY = 1.0 / 3.0
+"""Part of a material share above which the whole 95 % interval of a further effect must lie to be claimed.
+
+Choice: its best estimate is material, and it is surely there."""
+
 MOSTLY_OPEN = 0.5
 """Share of the gap above which what the effects found leave is the verdict (derived: it is more than all of them)."""
 
@@ -186,10 +191,11 @@ def headline(parts: Sequence[Part], share: Mapping[str, Interval], material: flo
     Args:
         parts: of the gap.
         share: of `shares`.
-        material: share from which an effect is claimed.
+        material: share from which the largest finding is claimed; a further effect, if it is surely there.
     """
     named = sorted((p for p in parts if p.name), key=lambda p: -p.amount)
-    claimed = [p for p in named if p.name in share and share[p.name].value >= material]
+    likely = [p for p in named if p.name in share and share[p.name].value >= material]
+    claimed = [p for p in likely if p is likely[0] or p.name == UNKNOWN or share[p.name].low >= SURELY * material]
     effects = _ids(p for p in claimed if p.name != UNKNOWN)
     small = [e for e in _ids(p for p in named if p not in claimed and p.name != UNKNOWN) if e not in effects]
     names = {p.name for p in claimed}

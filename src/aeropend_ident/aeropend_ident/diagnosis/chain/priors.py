@@ -71,7 +71,7 @@ STRAIGHT = 2.0
 """Largest ratio k3/k2 (derived: the formula for the voltage is then straight to 3 % of its range)."""
 
 REFERENCE_GRAVITY = 33.8
-"""[1/s²] `mgd_over_J` of the rig for which the catalogue's default sizes matter (config/bench.yaml)."""
+"""[1/s²] `mgd_over_J` of the rig for which the catalogue's default sizes matter (convention: config/bench.yaml)."""
 
 CHOSEN = (ZERO, "coulomb_friction.accel", "command_delay.delay", "thrust_lag.tau", "thrust_exponent.n")
 """Sizes of effects that the nominal model of a rig with angle and command alone is identified with if it needs them."""

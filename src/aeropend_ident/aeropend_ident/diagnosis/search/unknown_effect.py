@@ -46,13 +46,13 @@ class UnknownEffect:
     Attributes:
         stage: of the chain in which it acts.
         term: the missing term at its likeliest place.
-        instead: the stages whose effects may only approximate it: one term explains far more, they leave most, or none
-            of them is certain.
+        instead: whether the effects found in this stage may only approximate it: one term explains far more, they leave
+            most, or none of them is certain.
     """
 
     stage: str
     term: MissingTerm
-    instead: frozenset[str]
+    instead: bool
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def judge(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool, sp
     if share(worst, base) > MOSTLY_LEFT:
         instead.add(worst)
     term = _placed(chains, worst, findings[worst].base, known[worst]) if worst == "motor" else terms[worst]
-    return UnknownEffect(worst, term, frozenset(instead))
+    return UnknownEffect(worst, term, instead=worst in instead)
 
 
 def _placed(chains: CutChains, stage: str, base: Fit, known: list[Parameter]) -> MissingTerm:
