@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from aeropend_ident.bags.recording import Recording
 from aeropend_ident.diagnosis import diagnosis
 from aeropend_ident.diagnosis.diagnosis import Diagnosis
-from aeropend_ident.diagnosis.gap_share import MATERIAL_SHARE
+from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.identification import dataset
 from aeropend_ident.identification import identify as identification
 from aeropend_ident.identification.dataset import Dataset

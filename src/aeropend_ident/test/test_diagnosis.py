@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aeropend_ident.diagnosis.diagnosis import diagnose
-from aeropend_ident.diagnosis.gap_share import MATERIAL_SHARE
+from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.diagnosis.results import document, verdict_lines
 from aeropend_ident.diagnosis.validation import validate
 from aeropend_ident.signals.signals import from_arrays

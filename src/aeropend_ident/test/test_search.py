@@ -11,7 +11,8 @@ from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.search.hypotheses import from_linear, linear_parameters
-from aeropend_ident.diagnosis.search.search import _with_better_rivals, refit, search
+from aeropend_ident.diagnosis.search.search import _with_better_rivals, refit, search, trifling_gap, unsearched
+from aeropend_ident.diagnosis.search.selection import squared_gap
 from aeropend_ident.signals.signals import from_arrays
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import rig
@@ -125,6 +126,16 @@ def test_what_only_stood_in_for_an_effect_gives_way_to_it():
     assert [h.name for h in findings.effects] == ["coulomb_friction", "cable_torque"]
     assert findings.found[0][0].probability > 0.999
     assert [w.probability for w in findings.found[0][1:]] == pytest.approx([0.0] * (len(others) + 1), abs=1e-3)
+
+
+def test_a_trifle_is_searched_only_if_a_person_wants_it():
+    chains = CutChains(BENCH, [recording({"coulomb_friction": {"accel": 1.5}, "quadratic_drag": {"k": 0.15}}, 4, 20.0)])
+    nominal = unsearched(chains)
+    assert [h.name for h in search(chains, 2)["arm"].effects] == ["coulomb_friction", "quadratic_drag"]
+    found = search(chains, 2, trifle=trifling_gap(chains, nominal))["arm"]
+    assert [h.name for h in found.effects] == ["coulomb_friction"]
+    left, before = (squared_gap(chains, f) for f in (found.final, found.base))
+    assert 0.0 < left < 0.003 * before
 
 
 # --- what is not in the catalogue

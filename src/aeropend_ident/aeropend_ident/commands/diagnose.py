@@ -24,7 +24,7 @@ from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.diagnosis import batch, dask_cluster
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.document import Across
-from aeropend_ident.diagnosis.gap_share import MATERIAL_SHARE
+from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.diagnosis.results import FILES, Results, document
 from aeropend_ident.diagnosis.validation import validate
 from aeropend_ident.result_folder import ensure_free, folder_names

@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.diagnosis import dask_cluster
 from aeropend_ident.diagnosis.diagnosis import diagnose
-from aeropend_ident.diagnosis.gap_share import MATERIAL_SHARE
+from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.diagnosis.results import Results, document
 from aeropend_ident.result_folder import OutputError, on_interrupt
 from aeropend_ident.signals.from_bag import signals_of

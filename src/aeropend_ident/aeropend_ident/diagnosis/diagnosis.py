@@ -41,14 +41,14 @@ from aeropend_ident.diagnosis.document import UnknownEffect as DrawnEffect
 from aeropend_ident.diagnosis.experiment_design import EXPERIMENTS, experiments_within
 from aeropend_ident.diagnosis.free_run_gap import Gap, HeldOut, closure, gap
 from aeropend_ident.diagnosis.gap_budget import Repeats, budget
-from aeropend_ident.diagnosis.gap_share import MATERIAL_SHARE, Part
+from aeropend_ident.diagnosis.gap_share import Part
 from aeropend_ident.diagnosis.joint_fit import JointFit, fit_jointly
-from aeropend_ident.diagnosis.policy import GOOD_ENOUGH, angle_only, policy_of
+from aeropend_ident.diagnosis.policy import GOOD_ENOUGH, MATERIAL_SHARE, angle_only, policy_of
 from aeropend_ident.diagnosis.search import gust, onset, speed_spikes, unknown_effect
 from aeropend_ident.diagnosis.search.findings import Findings
 from aeropend_ident.diagnosis.search.free_curves import MissingTerm, Repeatable
 from aeropend_ident.diagnosis.search.onset import Onset
-from aeropend_ident.diagnosis.search.search import refit, search, unsearched
+from aeropend_ident.diagnosis.search.search import refit, search, trifling_gap, unsearched
 from aeropend_ident.diagnosis.search.unknown_effect import UnknownEffect
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import CHANNELS, Signals
@@ -216,7 +216,7 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     found = _find(fitted, settings, progress)
     progress("fitting all jointly", 0.75)
     found, joint, gaps = _fit_and_measure(fitted, found, progress)
-    if _changes_later(gaps):
+    if found.unknown is None and _changes_later(gaps):  # an unknown effect may show elsewhere in what follows
         return _diagnose(_fitted_further(fitted), settings, progress)
     if found.unknown is not None and gaps.after.within(gaps.floors, CHANNELS_OF[found.unknown.stage]):
         found = replace(found, unknown=None)
@@ -274,14 +274,21 @@ def _fit_and_measure(fitted: CutChains, found: _Findings, progress: Progress) ->
 
 
 def _without(found: _Findings, names: Collection[str]) -> _Findings:
-    """The findings without some effects: those that make the gap larger on data that no fit has used."""
+    """The findings without some effects, those that make the gap larger on data that no fit has used.
+
+    What is left without them decides again whether it is random, or unknown.
+    """
     stages = dict(found.stages)
     for stage, f in found.stages.items():
         kept = tuple(s for s in f.found if s[0].hypothesis.name not in names)
         if len(kept) < len(f.found):
             final = refit(found.chains, stage, [s[0].hypothesis for s in kept], f.final.values)
             stages[stage] = replace(f, found=kept, final=final)
-    return replace(found, stages=stages)
+    detected = gust.detect(found.chains, stages["arm"])
+    stages["arm"] = detected.arm
+    unknown = unknown_effect.judge(found.chains, stages, gust=detected.gust is not None,
+                                   spikes=found.statistical.spikes is not None)
+    return replace(found, stages=stages, statistical=replace(found.statistical, gust=detected.gust), unknown=unknown)
 
 
 def _repeats(parts: Sequence[Part], material: float) -> bool:
@@ -305,8 +312,9 @@ def _approximated(unknown: UnknownEffect, joint: JointFit, gaps: _Gaps, parts: S
 def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Findings:
     """Search effects, detect those that only statistics show, and judge whether one is unknown."""
     chains, recordings = fitted, fitted.recordings
+    stages = unsearched(fitted)
+    trifle = trifling_gap(fitted, stages)
     if fitted.policy.wide_search:
-        stages = unsearched(fitted)
         left = stages["arm"].base.residuals
         if fitted.likely:  # the model was identified with dry friction, which the search has still to find
             left = fit_own(with_values(fitted.model, fitted.likely), recordings).residuals
@@ -319,7 +327,8 @@ def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Finding
 
     def searched(chains: CutChains) -> dict[str, Findings]:
         return search(chains, settings.jobs,
-                      lambda stage, share: progress(f"searching effects of the {stage}", 0.7 * share), deadline)
+                      lambda stage, share: progress(f"searching effects of the {stage}", 0.7 * share), deadline,
+                      trifle)
 
     chains, stages, begun = onset.search_within_windows(chains, searched(chains), searched)
     recordings = [replace(s, window=c.window) for s, c in zip(recordings, chains.recordings, strict=True)]

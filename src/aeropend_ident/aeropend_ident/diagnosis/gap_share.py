@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,11 +31,6 @@ LARGEST_UNSURE = 1e3
 
 CAPTURES = "speed_spikes"
 """Name of the part that false captures make."""
-
-MATERIAL_SHARE = 0.03
-"""Share of the gap from which an effect is claimed, unless a person sets another.
-
-Choice: without an effect of this share the gap (RMS) grows by 1.5 %, which changes nothing that a model is used for."""
 
 SURELY = 1.0 / 3.0
 """Part of a material share above which the whole 95 % interval of a further effect must lie to be claimed.
@@ -87,6 +82,9 @@ class Headline:
 def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[Part]:
     """The part of each effect that was fitted: the others are fitted again without it.
 
+    Where effects of a stage stand in for each other, little comes back without one of them. Their parts are then made
+    larger in proportion, so that their sum is what comes back without all of them.
+
     Args:
         joint: the joint fit.
         held_out: measures gaps.
@@ -94,16 +92,27 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
     """
     after = held_out.gap_of(joint.values)
 
-    def part(h: Hypothesis) -> Part:
-        without = held_out.gap_of(joint.without([h]))
+    def part(effects: Sequence[Hypothesis]) -> Part:
+        h, without = effects[0], held_out.gap_of(joint.without(effects))
         size = h.own[0].name
         distance = abs(joint.values[size] - neutral(held_out.model, size))
         return Part(h.name, h.place, without.total**2 - after.total**2, _windows(without) - _windows(after),
                     min(joint.sd[size] / max(distance, 1e-300), LARGEST_UNSURE))
 
-    effects = [h for f in joint.findings.values() for h in f.effects]
+    stages = [f.effects for f in joint.findings.values() if f.effects]
     with ThreadPoolExecutor(jobs) as pool:
-        return list(pool.map(part, effects))
+        each = [[pool.submit(part, [h]) for h in effects] for effects in stages]
+        every = [pool.submit(part, effects) if len(effects) > 1 else own[0]
+                 for effects, own in zip(stages, each, strict=True)]
+    return [p for own, together in zip(each, every, strict=True)
+            for p in _adding_up([work.result() for work in own], together.result())]
+
+
+def _adding_up(parts: Sequence[Part], together: Part) -> list[Part]:
+    """The parts of effects of a stage, made larger if they stand in for each other."""
+    total = sum(max(p.amount, 0.0) for p in parts)
+    factor = max(together.amount / total, 1.0) if total > 0.0 else 1.0
+    return [replace(p, amount=factor * p.amount, windows=factor * p.windows) for p in parts]
 
 
 def part_of_several(effects: Sequence[Hypothesis], joint: JointFit, held_out: HeldOut, place: str) -> Part:

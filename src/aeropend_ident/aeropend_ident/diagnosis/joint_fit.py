@@ -18,8 +18,8 @@ from aeropend_ident.diagnosis.policy import CERTAIN
 from aeropend_ident.diagnosis.search.findings import Findings, Selection
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
-from aeropend_ident.diagnosis.search.search import refit, within_prior
-from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess
+from aeropend_ident.diagnosis.search.search import refit
+from aeropend_ident.estimation.map_fit import Fit, fit
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.statistics import Z95, rms
 from aeropend_sim.model.parameters import Model
@@ -89,7 +89,7 @@ class JointFit:
         """The values that fit best without some of the effects; calibrated parameters stay within their priors."""
         rest = {stage: replace(f, found=tuple(s for s in f.found if s[0].hypothesis not in effects))
                 for stage, f in self.findings.items()}
-        parameters = within_prior(self.chains, _parameters(self.chains, rest).values())
+        parameters = list(_parameters(self.chains, rest).values())
         residuals = self.chains.joined(_free_run_residuals(self.chains))
 
         def misfit(start: Mapping[str, float]) -> float:
@@ -183,8 +183,7 @@ def _with_run_to_run(chains: CutChains, findings: Mapping[str, Findings], joint:
         sizes = [h.own[0].name for f in findings.values() for h in f.effects]
         starts = [start, *({**start, n: factor * start[n]} for n in sizes for factor in OTHER_SIZES)]
         fits = [fit(residuals, started(_parameters(one, findings).values(), s)) for s in starts]
-        ess = largest_ess(fits)
-        alone.append(max(fits, key=lambda f: f.log_likelihood(ess) + f.log_prior))
+        alone.append(max(fits, key=lambda f: f.log_likelihood + f.log_prior))
     own = {key(name).plain for name in sd if key(name).recording}
     for name, alike in joint.sd.items():
         if not key(name).is_initial and key(name).plain not in own and all(name in f.values for f in alone):

@@ -23,7 +23,7 @@ from aeropend_ident.diagnosis.document import (
     ParameterRow,
     to_json,
 )
-from aeropend_ident.diagnosis.gap_share import MATERIAL_SHARE
+from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.diagnosis.report import page
 from aeropend_ident.diagnosis.report.candidates import unit_of
 from aeropend_ident.result_folder import atomic_folder, ensure_free

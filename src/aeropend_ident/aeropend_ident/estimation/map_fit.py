@@ -8,10 +8,11 @@ With residuals r_c (in units of a reading's noise) of channels c, and parameters
 - s_c >= 1 inflates the noise to the RMS of the residual: a model that does not fit cannot claim a precise fit.
 - ess_c <= n_c is the effective sample size: a coloured residual holds less information than its samples.
 - The prior (z standard normal) keeps parameters from moving far to stand in for a missing effect.
+- A parameter that is pushed against its bound is left out of a step.
 
 Both weights are renewed as the fit goes on. Fits are compared by their log evidence in Laplace's approximation: log
-likelihood plus log Occam factor, the prior density times the posterior volume (D. MacKay, Information Theory,
-Inference, and Learning Algorithms, 2003, chapter 28).
+likelihood, with noise that has a spectrum (`whittle`), plus log Occam factor, the prior density times the posterior
+volume (D. MacKay, Information Theory, Inference, and Learning Algorithms, 2003, chapter 28).
 
 The steps are Levenberg-Marquardt's. `scipy.optimize.least_squares` with the same residuals, Jacobian and weights ends
 at the same cost and takes 2.5 to 3 times the CPU time (`make bench ARGS="--only optimiser"`): it restarts whenever
@@ -22,9 +23,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dct
 
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.statistics import effective_sample_size
@@ -52,6 +55,12 @@ DAMPING, DAMPING_DOWN, DAMPING_UP, MOST_DAMPING = 1e-3, 0.2, 8.0, 1e6
 """Levenberg-Marquardt damping: first value, factors after a step that succeeds and one that fails, and where it ends.
 
 Choice; any factors from 0.1 and 10 on lead to the same minimum."""
+
+GOOD_STEP = 0.75
+"""Share of the expected decrease below which the derivatives are computed anew, rather than corrected (choice)."""
+
+NARROWEST = 8
+"""Coefficients of the cosine transform in the narrowest band (choice: their mean square is then good to a half)."""
 
 ENOUGH, ENOUGH_OF_EXCESS = 1e-2, 1e-4
 """Decrease of the cost below which the search stops: absolute, and relative to the cost above that of noise.
@@ -92,15 +101,12 @@ class Fit:
         Args:
             ess: channel -> effective sample size; the same for all fits that are compared.
         """
-        return self.log_likelihood(ess) + self.log_occam(ess)
+        return self.log_likelihood + self.log_occam(ess)
 
-    def log_likelihood(self, ess: Mapping[str, float]) -> float:
-        """Log likelihood, normal with the inflated noise; `ess` as in `log_evidence`."""
-        total = 0.0
-        for channel, r in self.residuals.items():
-            s2 = self.scale[channel] ** 2
-            total -= 0.5 * ess[channel] * (np.log(s2) + float(np.mean(r * r)) / s2)
-        return total
+    @cached_property
+    def log_likelihood(self) -> float:
+        """Log likelihood with noise that has a spectrum; see `whittle`."""
+        return sum(whittle(r) for r in self.residuals.values())
 
     def log_occam(self, ess: Mapping[str, float]) -> float:
         """Log Occam factor: prior density at the estimate times posterior volume; `ess` as in `log_evidence`."""
@@ -129,6 +135,35 @@ def largest_ess(fits: Iterable[Fit]) -> dict[str, float]:
     return ess
 
 
+def whittle(r: Array) -> float:
+    """Log likelihood of a residual whose noise has a spectrum of its own (P. Whittle, 1953).
+
+    The noise in each band of frequency is that of the residual itself, but at least that of the readings. A slow misfit
+    counts for as many samples as its band holds.
+
+    Args:
+        r: (N,) in units of a reading's noise.
+    """
+    if not len(r):
+        return 0.0
+    edges = bands(len(r))
+    count = np.diff(edges)
+    power = np.add.reduceat(dct(r, norm="ortho") ** 2, edges[:-1]) / count
+    noise = np.maximum(power, 1.0)
+    return float(-0.5 * np.sum(count * (np.log(noise) + power / noise)))
+
+
+@cache
+def bands(n: int) -> NDArray[np.intp]:
+    """Edges (B + 1,) of the bands of the n coefficients of a cosine transform: each half as wide as its frequency."""
+    edges = [0]
+    while edges[-1] < n:
+        edges.append(edges[-1] + max(NARROWEST, edges[-1] // 2))
+    edges[-1] = n
+    return np.array(edges)
+
+
+@dataclass(frozen=True)
 class Sensitivities:
     """Derivatives of one channel's residual (N,).
 
@@ -137,8 +172,14 @@ class Sensitivities:
         rows: (P, N) derivatives.
     """
 
-    def __init__(self, by: NDArray[np.intp], n: int) -> None:
-        self.by, self.rows = by, np.empty((len(by), n))
+    by: NDArray[np.intp]
+    rows: Array
+
+    def corrected(self, step: Array, change: Array) -> Sensitivities:
+        """The derivatives corrected by what a step (all parameters,) changed, (N,), with Broyden's formula."""
+        own = step[self.by]
+        size = max(float(own @ own), 1e-300)
+        return Sensitivities(self.by, self.rows + np.outer(own / size, change - own @ self.rows))
 
 
 class Search:
@@ -148,18 +189,18 @@ class Search:
         residuals: values by name -> residuals in units of a reading's noise.
         parameters: to be fitted.
         least_ess: effective sample size that a channel counts for at least.
-        holds: whether a parameter that is pushed against its bound is left out of a step.
     """
 
     def __init__(self, residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter],
-                 least_ess: float = 0.0, *, holds: bool = False) -> None:
+                 least_ess: float = 0.0) -> None:
         self.residuals, self.parameters, self.least_ess = residuals, tuple(parameters), least_ess
-        self.holds = holds
         self.low = np.array([p.to_standard(p.low) for p in parameters])
         self.high = np.array([p.to_standard(p.high) for p in parameters])
         self.z = np.array([p.to_standard(p.begin) for p in parameters])
         self.z = np.clip(self.z, self.low, self.high)
         self.current = self.at(self.z)
+        self.slopes: dict[str, Sensitivities] = {}
+        self.fresh = False
         self.renew_weights()
 
     def at(self, z: Array) -> dict[str, Array]:
@@ -178,8 +219,16 @@ class Search:
         """Weighted residuals of all channels as one vector."""
         return np.concatenate([self.weight[k] * residuals[k] for k in self.weight] or [np.zeros(0)])
 
-    def jacobian(self, step: float = STEP) -> dict[str, Sensitivities]:
-        """Derivatives of the weighted residuals, by finite differences towards the inside of the bounds.
+    def jacobian(self) -> dict[str, Sensitivities]:
+        """Derivatives of the weighted residuals, by finite differences."""
+        return self.weighted(self.differences())
+
+    def weighted(self, slopes: Mapping[str, Sensitivities]) -> dict[str, Sensitivities]:
+        """Derivatives of the weighted residuals from those of the residuals."""
+        return {k: Sensitivities(s.by, self.weight[k] * s.rows) for k, s in slopes.items()}
+
+    def differences(self, step: float = STEP) -> dict[str, Sensitivities]:
+        """Derivatives of the residuals, by finite differences towards the inside of the bounds.
 
         A parameter that each recording has a value of its own for is moved in all recordings at once.
         """
@@ -189,8 +238,10 @@ class Search:
             name = key(p.name)
             groups.setdefault(name.plain, {})[name.recording] = j
         by = {k: [g.get(key(k).recording, g.get(0, -1)) for g in groups.values()] for k in self.weight}
-        slopes = {k: Sensitivities(np.array([j for j in by[k] if j >= 0], int), len(self.current[k]))
-                  for k in self.weight}
+        slopes = {}
+        for k, each in by.items():
+            own = np.array([j for j in each if j >= 0], int)
+            slopes[k] = Sensitivities(own, np.empty((len(own), len(self.current[k]))))
         filled = dict.fromkeys(slopes, 0)
         for at, group in enumerate(groups.values()):
             z = self.z.copy()
@@ -198,7 +249,7 @@ class Search:
             moved = self.at(z)
             for k, s in slopes.items():
                 if (j := by[k][at]) >= 0:
-                    s.rows[filled[k]] = (self.weight[k] * moved[k] - self.weight[k] * self.current[k]) / moves[j]
+                    s.rows[filled[k]] = (moved[k] - self.current[k]) / moves[j]
                     filled[k] += 1
         return slopes
 
@@ -222,12 +273,12 @@ class Search:
         return information, gradient, products
 
     def free(self, z: Array, gradient: Array) -> NDArray[np.bool_]:
-        """Which parameters (P,) may move; with `holds`, not one that is pushed against its bound.
+        """Which parameters (P,) may move: not one that is pushed against its bound.
 
         A step that is computed with its move and then clipped is wrong for all others.
         """
         pushed = ((z <= self.low) & (gradient > 0.0)) | ((z >= self.high) & (gradient < 0.0))
-        return ~pushed if self.holds else np.ones(len(z), dtype=bool)
+        return ~pushed
 
     def improve(self, steps: int) -> tuple[Array, Products]:
         """Take Levenberg-Marquardt steps with the weights as they are.
@@ -241,10 +292,12 @@ class Search:
         damping = DAMPING
         information, products = np.eye(len(self.z)), Products()
         for _ in range(steps):
+            if not self.slopes:
+                self.slopes, self.fresh = self.differences(), True
             r = self.stack(self.current)
-            information, gradient, products = self.normal_equations(self.jacobian())
+            information, gradient, products = self.normal_equations(self.weighted(self.slopes))
             cost = float(r @ r + self.z @ self.z)
-            gained = 0.0
+            gained = expected = 0.0
             free = self.free(self.z, gradient)
             step = np.zeros(len(self.z))
             reduced = information[np.ix_(free, free)]
@@ -255,18 +308,26 @@ class Search:
                 r = self.stack(trial)
                 new = float(r @ r + z @ z)
                 if np.isfinite(new) and new < cost:
-                    gained = cost - new
+                    gained, moved = cost - new, z - self.z
+                    expected = -float(moved @ (2.0 * gradient + information @ moved))
+                    self.slopes = {k: s.corrected(moved, trial[k] - self.current[k]) for k, s in self.slopes.items()}
                     self.z, self.current = z, trial
                     damping *= DAMPING_DOWN
                     break
+                if not self.fresh:
+                    break
                 damping *= DAMPING_UP
-            if gained < ENOUGH + ENOUGH_OF_EXCESS * max(cost - sum(self.ess.values()), 0.0):
+            ended = gained < ENOUGH + ENOUGH_OF_EXCESS * max(cost - sum(self.ess.values()), 0.0)
+            if ended and self.fresh:
                 break
+            self.fresh = False
+            if ended or gained < GOOD_STEP * expected:
+                self.slopes = {}
         return information, products
 
 
 def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter],
-        rounds: int = 10, steps: int = 4, least_ess: float = 0.0, *, holds: bool = False) -> Fit:
+        rounds: int = 10, steps: int = 4, least_ess: float = 0.0) -> Fit:
     """MAP fit with the noise inflated to the residual; see the module.
 
     Args:
@@ -276,9 +337,8 @@ def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence
         steps: Levenberg-Marquardt steps in each round.
         least_ess: effective sample size that a channel counts for at least during the search. A slow drift has a small
             one; with wide priors the search would then stay near their means.
-        holds: whether a parameter that is pushed against its bound is left out of a step: needed where many end there.
     """
-    search = Search(residuals, parameters, least_ess, holds=holds)
+    search = Search(residuals, parameters, least_ess)
     information, products = np.eye(len(search.z)), Products()
     for _ in range(rounds):
         information, products = search.improve(steps)
@@ -295,7 +355,7 @@ def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence
 
 
 def screen(residuals: Callable[[dict[str, float]], Residuals], base: Fit, known: Sequence[Parameter],
-           additions: Sequence[Sequence[Parameter]]) -> list[float]:
+           additions: Sequence[Sequence[Parameter]], least_ess: float = 0.0) -> list[float]:
     """Share of the misfit that each addition would leave if the model were linear: one least-squares solve each.
 
     Args:
@@ -303,11 +363,12 @@ def screen(residuals: Callable[[dict[str, float]], Residuals], base: Fit, known:
         base: the fit without additions.
         known: its parameters.
         additions: groups of parameters, each tried at its starts.
+        least_ess: as for `fit`.
 
     Returns:
         Share of the weighted sum of squares that is left, one an addition; 1 where nothing changes.
     """
-    search = Search(residuals, started(known, base.values))
+    search = Search(residuals, started(known, base.values), least_ess)
     r = search.stack(search.current)
     slopes = search.jacobian()
     information, gradient, _ = search.normal_equations(slopes)

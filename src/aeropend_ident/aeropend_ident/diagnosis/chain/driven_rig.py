@@ -269,8 +269,7 @@ def _fitted(model: Model, recordings: Sequence[Signals], rounds: int, steps: int
 def fit_own(model: Model, recordings: Sequence[Signals], rounds: int = 10, steps: int = 4) -> Fit:
     """Fit the parameters of a nominal model, with those of the effects that it holds."""
     chains = CachedChains(model, recordings, UNCALIBRATED)
-    return fit(chains.residuals("arm"), nominal_parameters(chains, "arm"), rounds, steps, UNCALIBRATED.least_ess,
-               holds=True)
+    return fit(chains.residuals("arm"), nominal_parameters(chains, "arm"), rounds, steps, UNCALIBRATED.least_ess)
 
 
 def _error(model: Model, recordings: Sequence[Signals], f: Fit) -> float:
@@ -281,7 +280,7 @@ def _error(model: Model, recordings: Sequence[Signals], f: Fit) -> float:
     """
     chains = CachedChains(model, recordings, UNCALIBRATED)
     parameters = [replace(p, start=f.values[p.name]) for p in nominal_parameters(chains, "arm")]
-    search = Search(chains.residuals("arm"), parameters, UNCALIBRATED.least_ess, holds=True)
+    search = Search(chains.residuals("arm"), parameters, UNCALIBRATED.least_ess)
     slopes = search.jacobian()
     information, _, _ = search.normal_equations(slopes)
     errors = [_error_of_block(search, slopes, information, channel, block) for channel, s in slopes.items()

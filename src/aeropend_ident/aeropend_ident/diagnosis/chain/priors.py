@@ -28,6 +28,11 @@ CHAIN_SD = 0.06
 
 Derived: that of a uniform distribution over ±10 %, 0.1/√3. Usual resistors and capacitors have such tolerances."""
 
+OUTSIDE = 3.0
+"""Standard deviations of its prior up to which a calibrated parameter is fitted (convention: 99.7 %).
+
+A parameter further off is an effect of its own, `parameter_mismatch`; it must not stand in for another one."""
+
 UNCALIBRATED_SD = 0.55
 """Standard deviation of the logarithm of an uncalibrated parameter.
 
@@ -108,11 +113,14 @@ def model_parameters(chains: CutChains, stage: str) -> list[Parameter]:
             parameters.append(Parameter(name, nominal, UNCALIBRATED_SD, max(p.low, 1e-12), p.high, log=True))
         elif nominal != 0.0:
             sd = (NOMINAL_SD if calibrated else UNCALIBRATED_SD) * abs(nominal)
-            parameters.append(Parameter(name, nominal, sd, p.low, p.high))
+            reach = OUTSIDE * sd if calibrated else math.inf
+            parameters.append(Parameter(name, nominal, sd, max(p.low, nominal - reach), min(p.high, nominal + reach)))
     if calibrated:
         tau = chains.model.sensing[key(FILTER).name]
-        own = [Parameter(FILTER, tau, CHAIN_SD * tau, 0.0, 1.0)] if stage == "arm" and tau > 0.0 else []
-        return [*parameters, *own]
+        if stage == "arm" and tau > 0.0:
+            reach = OUTSIDE * CHAIN_SD * tau
+            parameters.append(Parameter(FILTER, tau, CHAIN_SD * tau, tau - reach, tau + reach))
+        return parameters
     if stage == "arm":
         parameters.append(_filter(chains.model))
     return _of_each(parameters, len(recordings))

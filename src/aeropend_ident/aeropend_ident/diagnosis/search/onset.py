@@ -24,10 +24,9 @@ from aeropend_ident.diagnosis.search.findings import Findings, adopted
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import EFFECT_ODDS, Hypothesis, hypotheses, stages_of
 from aeropend_ident.diagnosis.search.search import passes_as_noise
-from aeropend_ident.diagnosis.search.selection import CLOSE_GAIN, FORM_SHOWS
+from aeropend_ident.diagnosis.search.selection import CLOSE_GAIN, FORM_SHOWS, squared_gap
 from aeropend_ident.estimation.map_fit import Fit, Search, fit, largest_ess
 from aeropend_ident.estimation.parameter import Parameter, key, started
-from aeropend_ident.signals.signals import Signals
 
 Array = NDArray[np.float64]
 Window = tuple[int, int]
@@ -115,7 +114,7 @@ def _searched_within(chains: CutChains, findings: Mapping[str, Findings], window
     for _ in range(PASSES):
         again = with_window(chains, window)
         within = searched(again)
-        if not is_better(findings, within, chains.recordings[0]):
+        if not is_better(findings, within, chains):
             return None
         found = again, within, located(again, within)
         moved = found[2].window
@@ -173,10 +172,16 @@ def with_window(chains: CutChains, window: Window) -> CutChains:
     return type(chains)(chains.model, [replace(signals, window=window)], chains.policy)
 
 
-def is_better(once: Mapping[str, Findings], again: Mapping[str, Findings], signals: Signals) -> bool:
-    """Whether a search with a window has more evidence than one without, its instant and its prior odds included."""
+def is_better(once: Mapping[str, Findings], again: Mapping[str, Findings], chains: CutChains) -> bool:
+    """Whether a search with a window closes most of what one without leaves, and has more evidence.
+
+    Its instant and its prior odds are included.
+    """
+    signals = chains.recordings[0]
     tried = 2.0 * signals.train * signals.period / GRID
-    return math.log(EFFECT_ODDS / tried) + gained(once, again) > 0.0 and any(f.found for f in again.values())
+    left, before = (sum(squared_gap(chains, f.final) for f in each.values()) for each in (again, once))
+    enough = left < (1.0 - CLOSES) * before and any(f.found for f in again.values())
+    return enough and math.log(EFFECT_ODDS / tried) + gained(once, again) > 0.0
 
 
 def gained(once: Mapping[str, Findings], again: Mapping[str, Findings]) -> float:
@@ -284,11 +289,10 @@ def _best_windows(chains: CutChains, stage: str, f: Findings, candidates: Sequen
                 found.append((float(gain[k]), window, own))
     found.sort(key=lambda one: -one[0])
     tried = [_fitted(chain, stage, f.base, known, window, own) for _, window, own in found[:FOLLOWED]]
-    ess = largest_ess([f.final, *(one for one, _ in tried)])
     open_ = (1.0 - CLOSES) * (f.final.mean_square - 1.0)
-    likely = sorted(((one.log_likelihood(ess), window) for one, window in tried if one.mean_square - 1.0 < open_),
-                    reverse=True)
-    least = f.final.log_likelihood(ess) + STANDS_OUT
+    likely = sorted(((one.log_likelihood, window) for one, window in tried
+                     if one.mean_square - 1.0 < open_), reverse=True)
+    least = f.final.log_likelihood + STANDS_OUT
     windows: list[Window] = []
     for likelihood, window in likely:
         apart = all(max(abs(a - b) for a, b in zip(window, w, strict=True)) * signals.period > FOUND for w in windows)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -12,8 +12,8 @@ from scipy.special import expit
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import model_parameters, nominal_parameters
-from aeropend_ident.diagnosis.chain.values import STAGES
-from aeropend_ident.diagnosis.policy import MATERIAL
+from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, STAGES
+from aeropend_ident.diagnosis.policy import MATERIAL, MATERIAL_SHARE
 from aeropend_ident.diagnosis.search.findings import Findings, adopted, drop_unneeded
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import (
@@ -24,7 +24,13 @@ from aeropend_ident.diagnosis.search.hypotheses import (
     is_decided,
     stages_of,
 )
-from aeropend_ident.diagnosis.search.selection import CONTENDERS, ROUNDS, SelectionRound, log_evidence_over
+from aeropend_ident.diagnosis.search.selection import (
+    CONTENDERS,
+    ROUNDS,
+    SelectionRound,
+    log_evidence_over,
+    squared_gap,
+)
 from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess
 from aeropend_ident.estimation.parameter import Parameter, started
 
@@ -35,8 +41,10 @@ Choice: so little does not change a verdict, and is far above chance with some t
 
 Measured: at ±30 % no verdict of 2 recordings changes (docs/results/thresholds.md)."""
 
-OUTSIDE = 3.0
-"""Standard deviations of its prior by which a parameter must be off to be outside the prior (convention: 99.7 %)."""
+TRIFLE = 0.1
+"""Part of a material share of the gap below which the rest of a stage is not searched, nor an effect accepted (choice).
+
+Effects that overlap are worth more in the free run than in their stage: a whole share would be too much."""
 
 MOST_EFFECTS = 3
 """Effects that are searched in one stage (choice).
@@ -60,7 +68,7 @@ Derived: an effect is then more likely than none."""
 
 
 def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], None] = lambda *_: None,
-           deadline: float | None = None) -> dict[str, Findings]:
+           deadline: float | None = None, trifle: float = 0.0) -> dict[str, Findings]:
     """Search for effects stage by stage, along the chain.
 
     Args:
@@ -68,6 +76,8 @@ def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], No
         jobs: threads.
         progress: called with the stage and the share of stages behind it.
         deadline: [s] of `time.monotonic` after which no further effect is searched; None: the budget of the policy.
+        trifle: squared gap below which the rest of a stage is not searched, nor an effect accepted; see
+            `trifling_gap`.
 
     Returns:
         Stage -> what was found.
@@ -81,7 +91,7 @@ def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], No
         for done, stage in enumerate(STAGES):
             progress(stage, done / len(STAGES))
             mine = [h for h in everything if acts_on[h.name][:1] == (stage,)]
-            f = _search_stage(chains, stage, mine, acts_on, list(carried.values()), pool, deadline)
+            f = _search_stage(chains, stage, mine, acts_on, list(carried.values()), trifle, pool, deadline)
             findings[stage] = f
             # an effect that acts on later stages too goes along, with the uncertainty that it has here
             for h in f.effects:
@@ -103,20 +113,35 @@ def unsearched(chains: CutChains) -> dict[str, Findings]:
     return findings
 
 
+def trifling_gap(chains: CutChains, nominal: Mapping[str, Findings]) -> float:
+    """The squared gap that is a trifle, compared with what the nominal structure leaves in all stages.
+
+    A decay has no other: what matters in its few swings is decided by the evidence.
+
+    Args:
+        chains: cut.
+        nominal: what `unsearched` returns.
+    """
+    if not chains.policy.driven:
+        return 0.0
+    return TRIFLE * MATERIAL_SHARE * sum(squared_gap(chains, f.final, CHANNELS_OF[b]) for b, f in nominal.items())
+
+
 def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
-                  acts_on: Mapping[str, tuple[str, ...]], carried: list[Parameter], pool: ThreadPoolExecutor,
-                  deadline: float | None) -> Findings:
+                  acts_on: Mapping[str, tuple[str, ...]], carried: list[Parameter], trifle: float,
+                  pool: ThreadPoolExecutor, deadline: float | None) -> Findings:
     nominal: list[Parameter] = [*nominal_parameters(chains, stage), *carried]
-    base = fit(chains.residuals(stage), nominal)
+    base = fit(chains.residuals(stage), nominal, least_ess=chains.policy.least_ess)
     findings = Findings(stage, base, base)
     if not base.residuals:
         return findings
     candidates = [delay_from_voltage(chains, h, base.values) for h in candidates]
     others = {b for h in candidates for b in acts_on[h.name] if b != stage}
-    downstream = {b: fit(chains.residuals(b), nominal_parameters(chains, b)) for b in others}
+    downstream = {b: fit(chains.residuals(b), nominal_parameters(chains, b), least_ess=chains.policy.least_ess)
+                  for b in others}
     known = nominal
     while len(findings.found) < MOST_EFFECTS:
-        here = SelectionRound(chains, stage, acts_on, downstream, known, findings.final, pool, deadline)
+        here = SelectionRound(chains, stage, acts_on, downstream, known, findings, trifle, pool, deadline)
         if chains.policy.driven and _explained(here):
             break
         if here.budget_spent:
@@ -148,15 +173,16 @@ def _select(here: SelectionRound, findings: Findings, candidates: list[Hypothesi
         tried = here.from_plain(open_, tried)
     ranked = here.ranked(tried)
     # the parameters that the best hypothesis was led to may serve as well without it
-    again = fit(chains.residuals(here.stage), started(here.known, ranked[0].fit.values))
+    again = fit(chains.residuals(here.stage), started(here.known, ranked[0].fit.values),
+                least_ess=chains.policy.least_ess)
     ess = largest_ess([here.current, again])
     if again.log_evidence(ess) > here.current.log_evidence(ess) + BETTER_ALONE:
-        here = replace(here, current=again)
         findings = replace(findings, final=again, base=findings.base if findings.found else again)
+        here = replace(here, findings=findings)
         ranked = here.ranked(tried)
     best = ranked[0]
-    matters = (best.hypothesis.parameter or _material(here.current, best.fit)
-               or outside_prior(chains, here.stage, here.current))
+    matters = (best.hypothesis.parameter or at_end_of_prior(chains, here.stage, here.current)
+               or (_material(here.current, best.fit) and here.closes(best.fit) > here.trifle))
     if not policy.driven and findings.found:  # a residual in a narrow band seems to hold many independent samples
         sure = [float(expit(log_evidence_over(here.current, r.fit) + r.hypothesis.log_odds)) for r in ranked]
         ranked = tuple(replace(r, probability=min(r.probability, p)) for r, p in zip(ranked, sure, strict=True))
@@ -229,30 +255,11 @@ def refit(chains: CutChains, stage: str, effects: Sequence[Hypothesis], start: M
     return fit(chains.residuals(stage), started(parameters, start))
 
 
-def outside_prior(chains: CutChains, stage: str, f: Fit) -> bool:
-    """Whether a calibrated parameter of the stage left its prior to stand in for a missing effect."""
+def at_end_of_prior(chains: CutChains, stage: str, f: Fit) -> bool:
+    """Whether a calibrated parameter of the stage went to the end of its prior, to stand in for a missing effect."""
     own = {p.name: p for p in model_parameters(chains, stage)}
     return chains.policy.calibrated and any(
-        abs(f.values[n] - p.mean) > OUTSIDE * p.sd for n, p in own.items() if n in f.values)
-
-
-def held_within_prior(chains: CutChains, stage: str, f: Fit, known: Collection[Parameter]) -> Fit:
-    """A fit of the nominal structure; if a parameter left its prior, a fit that keeps all within theirs."""
-    if not outside_prior(chains, stage, f):
-        return f
-    held = within_prior(chains, known)
-    carried = {n: v for n, v in f.values.items() if n not in {p.name for p in held}}
-    residuals = chains.residuals(stage)
-    return fit(lambda values: residuals({**carried, **values}), held)
-
-
-def within_prior(chains: CutChains, parameters: Collection[Parameter]) -> list[Parameter]:
-    """The parameters, with calibrated ones bounded to `OUTSIDE` standard deviations of their priors."""
-    if not chains.policy.calibrated:
-        return list(parameters)
-    own = {p.name for stage in STAGES for p in model_parameters(chains, stage)}
-    return [replace(p, low=max(p.low, p.mean - OUTSIDE * p.sd), high=min(p.high, p.mean + OUTSIDE * p.sd))
-            if p.name in own else p for p in parameters]
+        not p.low < f.values[n] < p.high for n, p in own.items() if n in f.values)
 
 
 def _explained(here: SelectionRound) -> bool:
@@ -261,9 +268,9 @@ def _explained(here: SelectionRound) -> bool:
     The noise of an uncalibrated rig is an estimate: a somewhat larger rest passes too if it follows neither inputs nor
     states.
     """
-    if outside_prior(here.chains, here.stage, here.current):
+    if at_end_of_prior(here.chains, here.stage, here.current):
         return False
-    if passes_as_noise(here.current, MATERIAL):
+    if passes_as_noise(here.current, MATERIAL) or here.left_open(here.current) <= here.trifle:
         return True
     policy = here.chains.policy
     if not policy.wide_search or not passes_as_noise(here.current, policy.noise_margin):

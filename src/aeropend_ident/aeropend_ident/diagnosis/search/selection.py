@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -20,11 +20,13 @@ import numpy as np
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD, absent, nominal_parameters
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF
-from aeropend_ident.diagnosis.search.findings import RankedHypothesis, Selection, adopted
+from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
+from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis, Selection, adopted
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, from_linear, linear_parameters
 from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess, screen
 from aeropend_ident.estimation.parameter import Parameter, key, started
+from aeropend_ident.signals.signals import CHANNELS
 from aeropend_ident.signals.statistics import effective_sample_size
 from aeropend_sim.model.effects import CATALOGUE
 
@@ -83,7 +85,8 @@ class SelectionRound:
         acts_on: name of a hypothesis -> the stages whose residuals it changes.
         downstream: fits of the later stages that some hypothesis changes, without any.
         known: the parameters so far.
-        current: their fit.
+        findings: of the stage so far.
+        trifle: squared gap that need not be closed.
         pool: threads.
         deadline: [s] of `time.monotonic` after which no further effect is searched; None: the budget decides.
     """
@@ -93,9 +96,15 @@ class SelectionRound:
     acts_on: Mapping[str, tuple[str, ...]]
     downstream: Mapping[str, Fit]
     known: list[Parameter]
-    current: Fit
+    findings: Findings
+    trifle: float
     pool: ThreadPoolExecutor
     deadline: float | None = None
+
+    @property
+    def current(self) -> Fit:
+        """The fit of the parameters so far."""
+        return self.findings.final
 
     @property
     def budget_spent(self) -> bool:
@@ -114,7 +123,8 @@ class SelectionRound:
     def _shortlist(self, candidates: list[Hypothesis]) -> list[tuple[Hypothesis, int]]:
         """Hypotheses and the number of their best start point."""
         groups = [(h, j) for h in candidates for j in range(len(h.starts))]
-        left = screen(self.chains.residuals(self.stage), self.current, self.known, [h.starts[j] for h, j in groups])
+        left = screen(self.chains.residuals(self.stage), self.current, self.known,
+                      [h.starts[j] for h, j in groups], self.chains.policy.least_ess)
         best: dict[str, tuple[float, Hypothesis, int]] = {}
         for (h, j), x in zip(groups, left, strict=True):
             if h.name not in best or x < best[h.name][0]:
@@ -144,7 +154,7 @@ class SelectionRound:
         best = self._submit(lead, ROUNDS, begun=begun.values).result()
         rounds = self.chains.policy.screening_rounds
         again = [None if h is lead else self._submit(h, rounds, begun=best.values) for h, _ in tried]
-        return better(tried, [best if one is None else one.result() for one in again]), lead
+        return self._better(tried, [best if one is None else one.result() for one in again]), lead
 
     def converged(self, tried: FittedHypotheses, rounds: int = ROUNDS, *, but: Hypothesis | None = None
                   ) -> FittedHypotheses:
@@ -169,10 +179,9 @@ class SelectionRound:
 
         likeliest = [h for _, h, _ in self._likeliest(tried)[:CONTENDERS]]
         looks = [[w.result() for w in again(h)] if h in likeliest else [] for h, _ in tried]
-        ess = largest_ess([*(f for _, f in tried), *(f for fits in looks for f in fits)])
-        best = [max(fits, key=lambda f: f.log_likelihood(ess), default=None) for fits in looks]
+        best = [max(fits, key=lambda f: f.log_likelihood, default=None) for fits in looks]
         work = [self._submit(h, ROUNDS, begun=b.values) if b else None for (h, _), b in zip(tried, best, strict=True)]
-        return better(tried, [w.result() if w else f for (_, f), w in zip(tried, work, strict=True)])
+        return self._better(tried, [w.result() if w else f for (_, f), w in zip(tried, work, strict=True)])
 
     def from_plain(self, candidates: list[Hypothesis], tried: FittedHypotheses) -> FittedHypotheses:
         """Fit from the nominal model without its further terms, if nothing tried explains all.
@@ -185,34 +194,64 @@ class SelectionRound:
             return tried
         there = type(chains)(plain, chains.recordings, chains.policy)
         known = nominal_parameters(there, self.stage)
-        base = fit(there.residuals(self.stage), known, least_ess=chains.policy.least_ess, holds=True)
-        here = replace(self, chains=there, known=known, current=base)
+        base = fit(there.residuals(self.stage), known, least_ess=chains.policy.least_ess)
+        here = replace(self, chains=there, known=known, findings=replace(self.findings, final=base))
         lead, best = min(here.converged(here.screened(candidates)), key=lambda item: item[1].mean_square)
         if best.mean_square > min(f.mean_square for _, f in tried):
             return tried
         ended = self._fit(lead, ROUNDS, 0, {**absent(self.known), **best.values})
-        return [(h, f) for h, f in tried if h.name != lead.name] + better(
+        return [(h, f) for h, f in tried if h.name != lead.name] + self._better(
             [(lead, ended)], [f for h, f in tried if h.name == lead.name] or [ended])
 
     def ranked(self, tried: FittedHypotheses) -> Selection:
         """Log evidence of each over no further effect, and probabilities; the best first."""
         gains = [x + h.log_odds for (h, _), x in zip(tried, self._gains(tried, Fit.log_evidence), strict=True)]
-        weights = np.array([*gains, 0.0])
+        first = self._close_most(tried)
+        weights = np.where([*first, True], [*gains, 0.0], -np.inf)
         weights = np.exp(weights - weights.max())
         probability = weights / weights.sum()
         ranked = [RankedHypothesis(h, f, g, float(p)) for (h, f), g, p in zip(tried, gains, probability, strict=False)]
-        return tuple(self._ranked_by_place(sorted(ranked, key=lambda r: -r.gain)))
+        order = sorted(range(len(tried)), key=lambda j: (not first[j], -gains[j]))
+        return tuple(self._ranked_by_place([ranked[j] for j in order]))
+
+    def _close_most(self, tried: FittedHypotheses) -> list[bool]:
+        """Whether no other hypothesis leaves a materially smaller gap in this stage: evidence decides only among these.
+
+        With many samples the evidence goes by details that are significant but small.
+        """
+        left = [self.left_open(f) for _, f in tried]
+        most = min(left, default=0.0) + MATERIAL_SHARE * self.left_open(self.current)
+        return [x <= most for x in left]
+
+    def left_open(self, f: Fit) -> float:
+        """What a fit leaves of the squared gap in this stage."""
+        return squared_gap(self.chains, f, CHANNELS_OF[self.stage])
+
+    def closes(self, f: Fit) -> float:
+        """What a fit closes of the squared gap that is left, in this stage."""
+        return self.left_open(self.current) - self.left_open(f)
 
     def _likeliest(self, tried: FittedHypotheses) -> list[tuple[float, Hypothesis, Fit]]:
-        """Ordered by likelihood, which predicts the final rank better than evidence while fits are not at their end."""
-        gains = self._gains(tried, Fit.log_likelihood)
-        return sorted(((x, h, f) for x, (h, f) in zip(gains, tried, strict=True)), key=lambda item: -item[0])
+        """Those that close most first, each group ordered by likelihood.
+
+        It predicts the final rank better than the evidence while fits are not at their end.
+        """
+        gains = self._gains(tried, lambda f, _: f.log_likelihood)
+        first = self._close_most(tried)
+        order = sorted(range(len(tried)), key=lambda j: (not first[j], -gains[j]))
+        return [(gains[j], *tried[j]) for j in order]
 
     def _gains(self, tried: FittedHypotheses, of: Callable[[Fit, Mapping[str, float]], float]) -> list[float]:
         """How much more log evidence or likelihood each fit has than no further effect."""
         ess = largest_ess([self.current, *self.downstream.values(), *(f for _, f in tried)])
+        later = {b: of(f, ess) for b, f in self.downstream.items()}
         return [of(f, ess) - of(self.current, ess)
-                - sum(of(self.downstream[b], ess) for b in self.acts_on[h.name] if b != self.stage) for h, f in tried]
+                - sum(later[b] for b in self.acts_on[h.name] if b != self.stage) for h, f in tried]
+
+    def _better(self, tried: FittedHypotheses, again: list[Fit]) -> FittedHypotheses:
+        """Each hypothesis with the better of its two fits, by evidence."""
+        ess = largest_ess([*again, *(f for _, f in tried)])
+        return [(h, max(f, g, key=lambda x: x.log_evidence(ess))) for (h, f), g in zip(tried, again, strict=True)]
 
     def _ranked_by_place(self, ranked: list[RankedHypothesis]) -> list[RankedHypothesis]:
         """Decide between close rivals at different places if none of them explains the whole misfit.
@@ -284,16 +323,26 @@ class SelectionRound:
         return own
 
 
+def squared_gap(chains: CutChains, f: Fit, channels: Collection[str] = tuple(CHANNELS)) -> float:
+    """What a fit leaves of some channels above the noise of the readings, in units of their squared spread."""
+    total = 0.0
+    for channel, r in f.residuals.items():
+        k = key(channel)
+        if k.name not in channels:
+            continue
+        s = chains.each[k.recording].signals
+        noise = s.sigma[k.name]
+        if k.name == "omega" and s.pulses:
+            noise = float(np.sqrt(np.mean(s.pulses.sigma[s.pulses.index < s.train] ** 2)))
+        spread = max(float(np.nanstd(s.channel(k.name)[:s.train])), noise)
+        total += max(float(np.mean(r * r)) - 1.0, 0.0) * (noise / spread) ** 2
+    return total
+
+
 def mean_square(f: Fit, stage: str) -> float:
     """Mean square residual of a fit in the channels of a stage, in units of a reading's noise."""
     own = [r for k, r in f.residuals.items() if key(k).name in CHANNELS_OF[stage]]
     return float(np.mean(np.concatenate(own) ** 2)) if own else 0.0
-
-
-def better(tried: FittedHypotheses, again: list[Fit]) -> FittedHypotheses:
-    """Each hypothesis with the better of its two fits, by evidence."""
-    ess = largest_ess([*again, *(f for _, f in tried)])
-    return [(h, max(f, g, key=lambda x: x.log_evidence(ess))) for (h, f), g in zip(tried, again, strict=True)]
 
 
 def log_evidence_over(f: Fit, other: Fit) -> float:

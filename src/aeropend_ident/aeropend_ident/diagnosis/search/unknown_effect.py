@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import nominal_parameters
-from aeropend_ident.diagnosis.policy import CERTAIN, GOOD_ENOUGH
+from aeropend_ident.diagnosis.policy import CERTAIN, GOOD_ENOUGH, MATERIAL_SHARE
 from aeropend_ident.diagnosis.search import speed_spikes
 from aeropend_ident.diagnosis.search.findings import Findings
 from aeropend_ident.diagnosis.search.free_curves import MissingTerm, missing_terms
-from aeropend_ident.diagnosis.search.search import held_within_prior
 from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter, key
 
@@ -111,14 +110,13 @@ def judge(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool, sp
     limits = chains.policy.unknown
     known = {b: [p for p in nominal_parameters(chains, b) if p.name in f.base.values] for b, f in findings.items()}
     base = misfits({b: f.base for b, f in findings.items()})
-    # a parameter outside its prior absorbs part of the misfit of the nominal structure
-    held = misfits({b: held_within_prior(chains, b, f.base, known[b]) for b, f in findings.items()})
     left = misfits({b: f.final for b, f in findings.items()})
     amount = {b: sum(m.amount for m in left[b].values()) for b in findings}
     captures = speed_spikes.squared_gap(chains) if spikes else 0.0
 
-    def share(b: str, of: Misfits) -> float:
-        total = sum(m.amount for each in of.values() for m in each.values()) + captures
+    total = sum(m.amount for each in base.values() for m in each.values()) + captures
+
+    def share(b: str) -> float:
         return amount[b] / total if total > 0.0 else 0.0
 
     terms: dict[str, MissingTerm] = {}
@@ -131,18 +129,19 @@ def judge(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool, sp
         # several effects of one place may be one effect of another form; a parameter has no form
         several = len({h.place for h in f.effects}) > 1 or any(h.parameter for h in f.effects)
         simpler = f.final.mean_square - 1.0 > ONE_TERM * max(term.left - 1.0, 0.0)
-        kept = share(b, base)
-        if (share(b, held) > limits.form or (kept > limits.form_elsewhere and elsewhere)
+        kept = share(b)
+        if (kept > limits.form or (kept > limits.form_elsewhere and elsewhere)
                 or (kept > limits.form_of_several and several and simpler)
-                or any(m.remains(held[b][c], limits.kept) for c, m in left[b].items())):
+                or any(m.amount > MATERIAL_SHARE * total and m.remains(base[b][c], limits.kept)
+                       for c, m in left[b].items())):
             terms[b] = term
             certain = any(selection[0].gain > CERTAIN for selection in f.found)
-            if (simpler and (several or elsewhere)) or not certain:
+            if (simpler and kept > limits.instead) or not certain:
                 instead.add(b)
     if not terms:
         return None
     worst = max(terms, key=lambda b: amount[b])
-    if share(worst, base) > MOSTLY_LEFT:
+    if share(worst) > MOSTLY_LEFT:
         instead.add(worst)
     term = _placed(chains, worst, findings[worst].base, known[worst]) if worst == "motor" else terms[worst]
     return UnknownEffect(worst, term, instead=worst in instead)
