@@ -28,10 +28,13 @@ def driven(numbers=None, effects=None, seconds=25.0, hold=(0.5, 3.0), seed=0, si
         duty[k:k + n] = rng.choice([0.0, 1.0], p=[0.2, 0.8]) * rng.uniform(0.1, 0.5)
         k += n
     theta = dynamics.simulate(model, duty, PERIOD).theta + zero + NOISE * rng.standard_normal(len(duty))
+    return recorded(sign * theta, duty)
+
+
+def recorded(theta, duty) -> Signals:
     nothing = np.full(len(duty), np.nan)
-    sensing = {**BENCH.sensing, "angle_lsb": 0.0}
-    return from_arrays({"theta": sign * theta, "omega": nothing, "i_a": nothing, "v_a": nothing, "duty": duty}, PERIOD,
-                       sensing)
+    columns = {"theta": theta, "omega": nothing, "i_a": nothing, "v_a": nothing, "duty": duty}
+    return from_arrays(columns, PERIOD, {**BENCH.sensing, "angle_lsb": 0.0})
 
 
 def test_a_model_comes_back_from_other_units_as_it_was():
@@ -73,6 +76,21 @@ def test_delay_and_zero_are_the_rigs_own():
     assert body["which"]["verdict"] == "none"
     assert body["identified"]["own"]["command_delay.delay"]["value"] == pytest.approx(0.1, abs=0.02)
     assert body["identified"]["hangs_at"]["value"] == pytest.approx(0.08, abs=0.005)
+
+
+LAGS = {"command_delay": {"delay": 0.1}, "thrust_lag": {"tau": 0.1}}
+
+
+@pytest.mark.promise("Uncalibrated rigs", "A delay and a lag that a recording does not tell apart are said")
+@pytest.mark.parametrize("id_", LAGS)
+def test_a_delay_and_a_lag_that_slow_commands_do_not_tell_apart_are_said(id_):
+    assert fit_driven_rig(BENCH, [driven(effects={id_: LAGS[id_]})]).notes == ()
+    t = PERIOD * np.arange(2500)
+    duty = 0.3 + 0.06 * np.sin(1.3 * t) + 0.05 * np.sin(2.9 * t + 1.0) + 0.04 * np.sin(0.5 * t)
+    model = BENCH.with_effects({id_: LAGS[id_]})
+    theta = dynamics.simulate(model, duty, PERIOD).theta + 0.01 * np.random.default_rng(0).standard_normal(len(t))
+    (note,) = fit_driven_rig(BENCH, [recorded(theta, duty)]).notes
+    assert all(e in note for e in LAGS)
 
 
 def test_a_term_that_the_free_run_does_not_need_is_left_out():

@@ -123,6 +123,7 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
             rig = fit_driven_rig(model, recordings)
             found, likely = without_findings(rig.model, model, recordings, material)
             model, plain = replace(found, name=f"{model.name}, identified"), rig.plain
+            recordings = [s.noted(*rig.notes) for s in recordings]
         elif fit_nominal:
             model, recordings = fit_nominal_model(model, recordings)
         kind = CutChains if policy.calibrated else CachedChains

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
 from aeropend_ident.diagnosis.chain.priors import (
@@ -29,7 +30,7 @@ from aeropend_ident.diagnosis.chain.values import FILTER, of_rig, with_values
 from aeropend_ident.diagnosis.chain.weak_start import WeakForm, downsampled, likeliest
 from aeropend_ident.diagnosis.document import Lift
 from aeropend_ident.diagnosis.policy import UNCALIBRATED
-from aeropend_ident.estimation.map_fit import ENOUGH, Fit, Search, Sensitivities, fit
+from aeropend_ident.estimation.map_fit import ENOUGH, Fit, Search, Sensitivities, fit, largest_ess
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import actuator, dynamics
@@ -78,6 +79,9 @@ CURVE = 11
 
 Measured: at ±30 % no verdict of 3 recordings changes (docs/results/thresholds.md)."""
 
+LAGS = {"command_delay": "delay", "thrust_lag": "tau"}
+"""Effects of `CHOSEN` that put the lift off, and their sizes: each may stand in for the other."""
+
 POWER_OF = {"mgd_over_J": -2, "c_over_J": -1, "L_over_J": -2, "J_m": 1, "L_a": 1}
 """Parameter of the model -> power of time in its effect; those left out have none.
 
@@ -117,10 +121,17 @@ class Candidate:
 
 @dataclass(frozen=True)
 class DrivenRig:
-    """The nominal model as identified, and the best one without any of the terms of `CHOSEN`."""
+    """The nominal model of a rig.
+
+    Attributes:
+        model: as identified.
+        plain: the best one without any of the terms of `CHOSEN`.
+        notes: what the recordings do not tell.
+    """
 
     model: Model
     plain: Model
+    notes: tuple[str, ...] = ()
 
 
 def fit_driven_rig(model: Model, recordings: Sequence[Signals]) -> DrivenRig:
@@ -133,9 +144,11 @@ def fit_driven_rig(model: Model, recordings: Sequence[Signals]) -> DrivenRig:
     units = units_of(model, recordings)
     scaled = [downsampled(units.of(s), dynamics.LONGEST_STEP) for s in recordings]
     full, plain = _searched(units.model(model), scaled, keep=model.effects)
-    found = units.model(_chosen(full, scaled, keep=model.effects).model, back=True)
+    chosen = _chosen(full, scaled, keep=model.effects)
+    found = units.model(chosen.model, back=True)
     f = fit_own(found, recordings)
-    return DrivenRig(with_values(found, of_rig(f.values)), _rescaled(units.model(plain, back=True), found))
+    return DrivenRig(with_values(found, of_rig(f.values)), _rescaled(units.model(plain, back=True), found),
+                     _delay_or_lag(chosen, scaled, keep=model.effects))
 
 
 def _rescaled(plain: Model, found: Model) -> Model:
@@ -253,6 +266,24 @@ def _chosen(best: Candidate, recordings: Sequence[Signals], keep: Collection[str
         if simpler is None or (simpler.error > NEEDED * best.error and not gone):
             return best
         best = simpler
+
+
+def _delay_or_lag(best: Candidate, recordings: Sequence[Signals], keep: Collection[str]) -> tuple[str, ...]:
+    """A note if the recordings do not tell whether a transport delay or a second lag puts the lift off."""
+    here = [e for e in LAGS if e in best.model.effects]
+    if len(here) != 1 or here[0] in keep:
+        return ()
+    (other,) = (e for e in LAGS if e not in here)
+    effects = {e: p for e, p in best.model.effects.items() if e not in here}
+    as_long = {LAGS[other]: best.model.effect(here[0], LAGS[here[0]])}
+    f = fit_own(best.model.with_effects({**effects, other: as_long}), recordings, ROUNDS, STEPS)
+    ess = largest_ess([f, best.fit])
+    if expit(f.log_evidence(ess) - best.fit.log_evidence(ess)) < UNCALIBRATED.undecided:
+        return ()
+    said = (f"the recordings do not tell {here[0]}, which the identified model holds, from {other}: in its place that "
+            "explains the angle about as well; steps of the command tell them apart best")
+    return (said,)
+
 
 
 def _without(c: Candidate, recordings: Sequence[Signals], effect: str) -> Candidate:

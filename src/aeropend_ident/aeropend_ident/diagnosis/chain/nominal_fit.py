@@ -96,7 +96,8 @@ def fit_nominal_model(model: Model, recordings: Sequence[Signals]) -> tuple[Mode
         noisier = [_with_local_noise(chain, chains.values_of(f.values, k)) for k, chain in enumerate(chains.each)]
         return replace(found, name=name), noisier
     if angle_only(recordings):
-        return replace(fit_driven_rig(model, recordings).model, name=name), list(recordings)
+        rig = fit_driven_rig(model, recordings)
+        return replace(rig.model, name=name), [s.noted(*rig.notes) for s in recordings]
     return replace(_stage_by_stage(model, recordings, policy), name=name), list(recordings)
 
 
