@@ -101,9 +101,11 @@ def test_a_term_that_the_free_run_does_not_need_is_left_out():
 
 @pytest.mark.promise("Uncalibrated rigs", "An angle of the wrong sign gives no verdict, and the reason")
 def test_an_angle_that_falls_while_the_duty_lifts_gives_no_effect():
-    body = diagnose(BENCH, [driven(sign=-1.0)], 2, fit_nominal=True).body
+    found = diagnose(BENCH, [driven(sign=-1.0)], 2, fit_nominal=True)
+    body = found.body
     assert body["which"]["verdict"] == "cannot_tell"
     assert body["which"]["effects"] == []
+    assert not any("do not tell" in note for note in found.signals[0].notes)
     assert "sign" in body["which"]["unexplained"][0]
 
 

@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
+import math
+
 import numpy as np
 import pytest
 
 from aeropend_ident.bags.recording import RecordingError
+from aeropend_ident.signals.from_bag import signals_of
+from aeropend_ident.signals.outliers import joined_turns
 from aeropend_ident.signals.pulses import find_pulses
 from aeropend_ident.signals.signals import from_arrays
+from aeropend_ident.testing import bags
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import rig
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
@@ -240,3 +245,32 @@ def test_a_step_of_the_duty_into_lost_samples_lies_in_their_middle_and_is_said(l
     assert mean == pytest.approx(before + (after - before) * (lost / 2) / lost, abs=0.5 * abs(after - before) / lost)
     assert np.isnan(signals.i_a[first + lost:first + lost + 5]).all()
     assert any("1 step of the duty fell between samples" in note for note in signals.notes)
+
+
+@pytest.mark.parametrize("ends", [(-math.pi, math.pi), (0.0, 2.0 * math.pi)])
+def test_turns_of_an_angle_that_is_read_within_one_are_joined(ends):
+    t = np.arange(0.0, 10.0, 0.01)
+    angle = 0.02 + 8.0 * np.sin(0.7 * t) + 0.01 * np.random.default_rng(0).standard_normal(len(t))
+    read = ends[0] + (angle - ends[0]) % (2.0 * math.pi)
+    read[[50, 51, 400]] = np.nan
+    joined, jumps = joined_turns(read)
+    assert jumps > 3
+    assert joined[np.isfinite(read)] == pytest.approx(angle[np.isfinite(read)])
+    assert joined_turns(read[:300])[0] == pytest.approx(joined[:300], nan_ok=True)
+
+
+@pytest.mark.parametrize("angle", [np.linspace(0.0, 40.0, 500), np.where(np.arange(500) % 90 == 60, 5.0, 0.1)])
+def test_an_angle_over_several_turns_and_one_with_false_readings_stay_as_they_are(angle):
+    same, jumps = joined_turns(angle)
+    assert (same is angle, jumps) == (True, 0)
+
+
+def test_joined_turns_are_said(tmp_path):
+    columns_ = columns(8.0)
+    columns_["theta"] = np.mod(columns_["theta"] + 0.01 * np.sin(np.arange(len(columns_["theta"]))), 2.0 * math.pi)
+    bags.write(tmp_path / "bag", columns_, round(SAMPLE_PERIOD * 1e9))
+    signals = signals_of(tmp_path / "bag", None, BENCH.sensing)
+    (note,) = (n for n in signals.notes if "turn" in n)
+    assert note.startswith("theta jumps by a turn ")
+    assert np.nanmin(signals.theta) < -0.005
+    assert np.nanmax(signals.theta) < 3.0

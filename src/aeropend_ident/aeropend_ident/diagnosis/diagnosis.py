@@ -117,18 +117,18 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
         policy = policy_of(recordings, fit_nominal=fit_nominal)
         likely: dict[str, float] = {}
         plain = None
+        notes: tuple[str, ...] = ()
         if fit_nominal:
             progress("identifying the nominal model", 0.0)
         if policy.wide_search and angle_only(recordings):
             rig = fit_driven_rig(model, recordings)
             found, likely = without_findings(rig.model, model, recordings, material)
-            model, plain = replace(found, name=f"{model.name}, identified"), rig.plain
-            recordings = [s.noted(*rig.notes) for s in recordings]
+            model, plain, notes = replace(found, name=f"{model.name}, identified"), rig.plain, rig.notes
         elif fit_nominal:
             model, recordings = fit_nominal_model(model, recordings)
         kind = CutChains if policy.calibrated else CachedChains
         chains = with_pwm_timing(kind(model, recordings, policy))
-        chains.likely, chains.plain = likely, plain
+        chains.likely, chains.plain, chains.notes = likely, plain, notes
         return _diagnose(chains, Settings(jobs, material, seconds), progress)
 
 
@@ -332,7 +332,8 @@ def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Finding
                       trifle)
 
     chains, stages, begun = onset.search_within_windows(chains, searched(chains), searched)
-    recordings = [replace(s, window=c.window) for s, c in zip(recordings, chains.recordings, strict=True)]
+    recordings = [replace(s, window=c.window).noted(*fitted.notes)
+                  for s, c in zip(recordings, chains.recordings, strict=True)]
     if any(f.cut_short for f in stages.values()):
         recordings = [s.noted(CUT_SHORT) for s in recordings]
     progress("testing for random effects", 0.7)

@@ -21,8 +21,10 @@ from aeropend_ident.bags.recording import Recording, RecordingError
 from aeropend_ident.signals.free_decay import degrees, free_decay
 from aeropend_ident.signals.grid import check_period, irregular_grid, longest_piece, regular_grid
 from aeropend_ident.signals.noise import reading_noise_at
+from aeropend_ident.signals.outliers import joined_turns
 from aeropend_ident.signals.pulses import hold
 from aeropend_ident.signals.signals import CHANNELS, MINIMUM_DURATION, STILL, Signals, from_arrays
+from aeropend_sim.wording import counted
 
 Array = NDArray[np.float64]
 
@@ -82,6 +84,10 @@ def as_signals(read: Recording, sensing: Mapping[str, float], held_out: float = 
         held_out: share of the recording at its end that models are not fitted to.
         fit_nominal: whether the rig is uncalibrated.
     """
+    theta, jumps = joined_turns(read.theta)
+    if jumps:
+        said = f"theta jumps by a turn {counted(jumps, 'time')}, from an end of its range to the other: joined"
+        read = replace(read, theta=theta, notes=(*read.notes, said))
     if not fit_nominal:
         check_period(read)
         return from_recording(longest_piece(read), sensing, held_out)

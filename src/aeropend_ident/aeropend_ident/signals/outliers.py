@@ -45,6 +45,32 @@ FAR = 8.0
 
 Choice: normal noise exceeds it in one of 10^15 readings, which leaves room for heavier tails."""
 
+TURN, NEARLY = 2.0 * math.pi, 0.2
+"""[rad] A turn; and the part of it by which a jump from one end of an angle's range to the other may differ from it.
+
+Choice: an arm moves less than that between two readings."""
+
+
+def joined_turns(theta: Array) -> tuple[Array, int]:
+    """Join the turns of an angle that is read within one turn: from its end the reading jumps to its beginning.
+
+    Args:
+        theta: [rad] (N,) readings, NaN where missing.
+
+    Returns:
+        [rad] (N,) The angle without these jumps, from within half a turn of 0 on; and their number.
+    """
+    known = np.flatnonzero(np.isfinite(theta))
+    x = theta[known]
+    steps = np.diff(x)
+    jumps = np.abs(np.abs(steps) - TURN) < NEARLY * TURN
+    if not jumps.any() or np.ptp(x) > (1.0 + 0.5 * NEARLY) * TURN:
+        return theta, 0
+    turns = np.concatenate([[-np.round(x[0] / TURN)], np.where(jumps, -np.sign(steps), 0.0)]).cumsum()
+    joined = theta.copy()
+    joined[known] += TURN * turns
+    return joined, int(jumps.sum())
+
 
 def saturated(x: Array, period: float, *, smooth: bool = False) -> Mask:
     """Find the samples of a channel that sit at the end of its range, where the true value may lie beyond.

@@ -265,6 +265,7 @@ class CutChains:
         self.model, self.policy = model, policy
         self.likely: Mapping[str, float] = {}  # sizes of effects with which the parameters were identified
         self.plain: Model | None = None  # the best nominal model without further terms, of a driven rig
+        self.notes: tuple[str, ...] = ()  # what the recordings do not tell of the nominal model of a driven rig
         self.each = [self._cut(signals) for signals in recordings]
 
     def _cut(self, signals: Signals) -> CutChain:
