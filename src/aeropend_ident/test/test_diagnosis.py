@@ -92,7 +92,7 @@ def test_the_verdict_in_a_terminal_tells_the_shares_in_plain_characters():
     signals = recorded(71, {"coulomb_friction": {"accel": 0.2}, "brush_drop": {"v_brush": 0.8}})
     lines = verdict_lines(document(diagnose(BENCH, [signals], 2), ["bag"], "bench", 0.0))
     (claimed,) = (line for line in lines if line.startswith("  brush_drop: "))
-    (small,) = (line for line in lines if line.startswith("  small, not claimed: coulomb_friction, "))
+    (small,) = (line for line in lines if line.startswith("  not claimed: coulomb_friction, "))
     assert all(re.search(r"\d+ % \(-?\d+ to \d+ %\) of the gap$", line) for line in (claimed, small))
     assert lines == [printable(line) for line in lines]
 

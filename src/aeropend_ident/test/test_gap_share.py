@@ -63,6 +63,20 @@ def test_the_verdict_is_the_largest_part(parts, verdict, effects, small):
         assert head.place == "thrust"
 
 
+def test_an_effect_whose_share_may_be_nothing_is_no_claim():
+    varying = Part("gust", "arm", 1.0, np.tile([-6.0, 8.0], 5))
+    found = shares([varying, part("", 1.0)])
+    assert found["gust"].low < 0.0 < found["gust"].value
+    head = headline([varying, part("", 1.0)], found, 0.03)
+    assert (head.verdict, head.effects, head.small) == ("none", [], ["gust"])
+    said = gap_share.why_unsure(found, 0.03)
+    assert said.startswith("no effect brings the model surely closer")
+    assert "gust, has 50%" in said
+    assert gap_share.why_unsure(shares([part("gust", 0.01), part("", 1.0)]), 0.03) == ""
+    head = headline([varying, part("brush_drop", 0.5)], shares([varying, part("brush_drop", 0.5)]), 0.03)
+    assert head.verdict == "brush_drop"
+
+
 def test_mismatches_of_two_parameters_are_one_effect():
     parts = [part("parameter_mismatch:R_a", 2.0, "electrical"), part("parameter_mismatch:J_m", 1.0, "rotor")]
     head = headline(parts, shares(parts), 0.03)

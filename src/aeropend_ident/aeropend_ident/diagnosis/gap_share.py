@@ -200,10 +200,12 @@ def headline(parts: Sequence[Part], share: Mapping[str, Interval], material: flo
     Args:
         parts: of the gap.
         share: of `shares`.
-        material: share from which the largest finding is claimed; a further effect, if it is surely there.
+        material: share from which the largest finding is claimed, if its interval is above 0; a further effect, if it is
+            surely there.
     """
     named = sorted((p for p in parts if p.name), key=lambda p: -p.amount)
-    likely = [p for p in named if p.name in share and share[p.name].value >= material]
+    likely = [p for p in named if p.name in share and share[p.name].value >= material
+              and (p.name == UNKNOWN or share[p.name].low > 0.0)]
     claimed = [p for p in likely if p is likely[0] or p.name == UNKNOWN or share[p.name].low >= SURELY * material]
     effects = _ids(p for p in claimed if p.name != UNKNOWN)
     small = [e for e in _ids(p for p in named if p not in claimed and p.name != UNKNOWN) if e not in effects]
@@ -215,6 +217,22 @@ def headline(parts: Sequence[Part], share: Mapping[str, Interval], material: flo
         return Headline("none", "none", [], small, names)
     first = next(p for p in claimed if p.name != UNKNOWN)
     return Headline(effects[0], first.place, effects, small, names)
+
+
+def why_unsure(share: Mapping[str, Interval], material: float) -> str:
+    """Why no effect is claimed although some have a material share of the gap; "" if none has.
+
+    Args:
+        share: of `shares`.
+        material: share from which an effect is claimed.
+    """
+    found = {name: s for name, s in share.items() if name != UNKNOWN and s.value >= material}
+    if not found:
+        return ""
+    name = max(found, key=lambda n: found[n].value)
+    return (f"no effect brings the model surely closer to the unseen part: the likeliest, {name}, has "
+            f"{found[name].value:.0%} ({found[name].low:.0%} to {found[name].high:.0%}) of the gap; a recording with more "
+            "motion in its last third, or several recordings, help most")
 
 
 def share_of_places(parts: Sequence[Part], otherwise: Callable[[], Sequence[Part]]) -> list[tuple[str, float]]:

@@ -123,7 +123,7 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
     lines += [f"  {effect}: {describe(found[effect])}" for effect in which.effects]
     small = [f"{c.effect}, {of_the_gap(c.share)}" for c in which.candidates if c.share and not c.found]
     if small:
-        lines.append(f"  small, not claimed: {'; '.join(small)}")
+        lines.append(f"  not claimed: {'; '.join(small)}")
     lines += [f"  not separable by this recording: {' and '.join(pair)}" for pair in which.not_separable]
     if which.next_experiment:
         lines.append(f"  next: {experiment(which.next_experiment)}")

@@ -46,7 +46,7 @@ class Verdict:
         lines: the effects found.
         between: the 95 % interval of the closed share, or "".
         besides: place of an unknown effect beside the effects found, or "".
-        small: effects whose share of the gap is too small to be claimed.
+        small: effects whose share of the gap is too small, or too unsure, to be claimed.
         unexplained: reasons for the verdict "unknown".
     """
 
