@@ -200,8 +200,8 @@ def headline(parts: Sequence[Part], share: Mapping[str, Interval], material: flo
     Args:
         parts: of the gap.
         share: of `shares`.
-        material: share from which the largest finding is claimed, if its interval is above 0; a further effect, if it is
-            surely there.
+        material: share from which the largest finding is claimed, if its interval is above 0; a further effect, if it
+            is surely there.
     """
     named = sorted((p for p in parts if p.name), key=lambda p: -p.amount)
     likely = [p for p in named if p.name in share and share[p.name].value >= material
@@ -231,8 +231,8 @@ def why_unsure(share: Mapping[str, Interval], material: float) -> str:
         return ""
     name = max(found, key=lambda n: found[n].value)
     return (f"no effect brings the model surely closer to the unseen part: the likeliest, {name}, has "
-            f"{found[name].value:.0%} ({found[name].low:.0%} to {found[name].high:.0%}) of the gap; a recording with more "
-            "motion in its last third, or several recordings, help most")
+            f"{found[name].value:.0%} ({found[name].low:.0%} to {found[name].high:.0%}) of the gap; a recording with "
+            "more motion in its last third, or several recordings, help most")
 
 
 def share_of_places(parts: Sequence[Part], otherwise: Callable[[], Sequence[Part]]) -> list[tuple[str, float]]:
