@@ -164,3 +164,16 @@ def test_what_the_catalogue_explains_leaves_nothing_unknown(effects):
     which = diagnose(BENCH, [recording(effects, 5, 20.0)], 2).body["which"]
     assert which["effects"] == list(effects)
     assert which["unknown"] is None
+
+
+@pytest.mark.promise("Verdict", "Readings at unsteady instants are no unknown effect")
+@pytest.mark.parametrize("seed", [5, 6])
+def test_readings_at_unsteady_instants_are_nothing_unknown(seed):
+    def unsteady(columns, truth):
+        late = np.random.default_rng(seed).uniform(-0.45, 0.45, len(truth["i_a"]))
+        columns["i_a"] = columns["i_a"] + late * np.gradient(truth["i_a"])
+
+    diagnosis = diagnose(BENCH, [recording({}, seed, 20.0, unsteady)], 2)
+    left = diagnosis.body["which"]["residuals"]["i_a"]
+    assert 1.1 < left["rms"] < 1.3
+    assert diagnosis.body["which"]["verdict"] == "none"

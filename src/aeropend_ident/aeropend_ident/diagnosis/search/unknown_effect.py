@@ -18,6 +18,7 @@ from aeropend_ident.diagnosis.search.findings import Findings
 from aeropend_ident.diagnosis.search.free_curves import MissingTerm, missing_terms
 from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter, key
+from aeropend_ident.signals.statistics import effective_sample_size
 
 Array = NDArray[np.float64]
 
@@ -33,6 +34,11 @@ MOSTLY_LEFT = 0.5
 """Share of the misfit that effects of a stage leave above which they only approximate an unknown one.
 
 Derived: they explain less than they leave."""
+
+WHITE = 0.5
+"""Effective sample size, over the samples, above which a residual is white noise (choice).
+
+A small white excess is noise that was not seen before: readings at unsteady instants, or a coarser resolution."""
 
 VISIBLE = 0.005
 """RMS of a channel's misfit, relative to the channel's spread, above which it matters (choice)."""
@@ -63,6 +69,7 @@ class Misfit:
         noise: standard deviation of a reading.
         spread: standard deviation of the channel.
         count: readings that were fitted.
+        white: whether it is white noise.
         noticeable: mean square above which a misfit counts.
     """
 
@@ -70,11 +77,14 @@ class Misfit:
     noise: float
     spread: float
     count: int
+    white: bool
     noticeable: float
 
     @property
     def amount(self) -> float:
         """Squared gap above the noise, in units of the spread squared; 0 if it passes as noise."""
+        if self.white and self.square < GOOD_ENOUGH**2:
+            return 0.0
         shows = max(self.square - 1.0, 0.0) * (self.noise / self.spread) ** 2
         return shows if self.square > self.noticeable + BY_CHANCE * math.sqrt(2.0 / self.count) else 0.0
 
@@ -160,4 +170,5 @@ def _misfit(chains: CutChains, channel: str, r: Array) -> Misfit:
     if name == "omega" and s.pulses:
         noise = float(np.sqrt(np.mean(s.pulses.sigma[s.pulses.index < s.train] ** 2)))
     spread = max(float(np.nanstd(s.channel(name)[:s.train])), noise)
-    return Misfit(float(np.mean(r * r)), noise, spread, len(r), chains.policy.unknown.noticeable)
+    white = effective_sample_size(r) > WHITE * len(r)
+    return Misfit(float(np.mean(r * r)), noise, spread, len(r), white, chains.policy.unknown.noticeable)
