@@ -177,3 +177,18 @@ def test_readings_at_unsteady_instants_are_nothing_unknown(seed):
     left = diagnosis.body["which"]["residuals"]["i_a"]
     assert 1.1 < left["rms"] < 1.3
     assert diagnosis.body["which"]["verdict"] == "none"
+
+
+@pytest.mark.promise("Verdict", "Effects that close as much of a gap that stays open are said to be not separable")
+@pytest.mark.parametrize("seed", [4, 5])
+def test_lags_are_told_apart_only_where_nothing_else_is_missing(seed):
+    def rough(columns, truth):
+        k = np.arange(len(truth["theta"]))
+        columns["theta"] = columns["theta"] + 0.004 * np.sin(k / 97.0) + 0.003 * np.sin(k / 41.0)
+
+    clean, other = (diagnose(BENCH, [recording({"encoder_lag": {"tau": 0.03}}, seed, 20.0, read)], 2).body["which"]
+                    for read in (lambda *_: None, rough))
+    assert (clean["verdict"], clean["not_separable"]) == ("encoder_lag", [])
+    (pair,) = other["not_separable"]
+    assert sorted(pair) == ["encoder_lag", "thrust_lag"]
+    assert other["verdict"] in pair

@@ -13,7 +13,7 @@ from aeropend_ident.diagnosis import experiment_design
 from aeropend_ident.diagnosis.chain import driven_rig
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import CHOSEN, OF_THE_ARM, UNCALIBRATED_SD, ZERO, basis, model_parameters
-from aeropend_ident.diagnosis.chain.values import FILTER, STAGES, neutral, of_rig, with_values
+from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, FILTER, STAGES, neutral, of_rig, with_values
 from aeropend_ident.diagnosis.document import (
     Candidate,
     HangingAngle,
@@ -24,9 +24,11 @@ from aeropend_ident.diagnosis.document import (
 )
 from aeropend_ident.diagnosis.free_run_gap import HeldOut
 from aeropend_ident.diagnosis.joint_fit import JointFit
-from aeropend_ident.diagnosis.policy import CALIBRATED, angle_only
+from aeropend_ident.diagnosis.policy import CALIBRATED, MATERIAL_SHARE, angle_only
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis
 from aeropend_ident.diagnosis.search.onset import Onset
+from aeropend_ident.diagnosis.search.selection import FORM_SHOWS, mean_square, squared_gap
+from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.signals import Signals
 from aeropend_ident.signals.statistics import Z95
@@ -178,16 +180,39 @@ def candidates(joint: JointFit, statistical: Statistical, held_out: HeldOut, gap
     return tuple(sorted(rows.values(), key=lambda row: -row.probability))
 
 
-def not_separable(findings: Mapping[str, Findings], least: float) -> list[tuple[RankedHypothesis, RankedHypothesis]]:
-    """Pairs that the recordings cannot separate: the first of a selection, and its probable rivals.
+def not_separable(chains: CutChains, findings: Mapping[str, Findings]
+                  ) -> list[tuple[RankedHypothesis, RankedHypothesis]]:
+    """Pairs that the recordings cannot separate: the first of a selection, and a rival.
+
+    The rival is probable, or closes as much of the gap.
 
     Args:
+        chains: cut.
         findings: stage -> what is claimed.
-        least: probability above which a rival is not ruled out.
     """
-    return [(selection[0], r) for f in findings.values() for selection in f.selections
-            if selection and selection[0].probability > CALIBRATED.undecided for r in selection[1:]
-            if r.probability > least]
+    pairs = []
+    for stage, f in findings.items():
+        before = f.base
+        for selection in f.selections:
+            if not selection or selection[0].probability <= CALIBRATED.undecided:
+                continue
+            first, found = selection[0], selection in f.found
+            pairs += [(first, r) for r in selection[1:] if r.probability > chains.policy.undecided
+                      or (found and _closes_as_much(chains, stage, before, first, r))]
+            before = first.fit
+    return pairs
+
+
+def _closes_as_much(chains: CutChains, stage: str, before: Fit, first: RankedHypothesis, rival: RankedHypothesis
+                    ) -> bool:
+    """Whether a rival closes as much of the gap as the first, while neither explains all.
+
+    What both leave may then decide between them. A parameter that is off only stands in for an effect.
+    """
+    if rival.hypothesis.parameter or mean_square(first.fit, stage) < FORM_SHOWS:
+        return False
+    open_, best, left = (squared_gap(chains, f, CHANNELS_OF[stage]) for f in (before, first.fit, rival.fit))
+    return left - best < MATERIAL_SHARE * (open_ - best)
 
 
 def names(first: RankedHypothesis, second: RankedHypothesis) -> tuple[str, str]:

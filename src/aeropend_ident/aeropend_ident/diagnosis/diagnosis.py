@@ -380,7 +380,7 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
     reasons = [f"{c} is off by {x:.1f} times a reading's noise"
                for c, x in _left(stages, gust=found.statistical.gust is not None).items() if x > GOOD_ENOUGH]
     reasons = [failed] if failed else reasons
-    undecided = conclude.not_separable(stages, chains.policy.undecided)
+    undecided = conclude.not_separable(chains, stages)
     tried = EXPERIMENTS if calibrated else experiments_within(max(float(s.duty.max()) for s in found.recordings))
     rows = conclude.parameter_rows(chains, joint)
     closed, low, high = closure(gaps.before, gaps.after, gaps.floors)
