@@ -295,6 +295,12 @@ class Judged:
                                      score.key_of(self.main["effect"], self.main["parameters"]))
 
     @property
+    def first_or_not_separable(self) -> bool:
+        """Whether the main effect comes first, or is said to be not separable from the first."""
+        return self.first or (self.main is not None and score.key_of(self.main["effect"], self.main["parameters"])
+                              in self.answer.named)
+
+    @property
     def placed(self) -> bool:
         """Whether the place is that of the main effect."""
         return self.main is not None and self.answer.place == self.main["place"]
@@ -349,6 +355,8 @@ def figures(found: Sequence[Judged]) -> list[score.Figure]:
     right, share = (lambda js: [j.first for j in js]), score.share
     return [
         share("messy, half of the gap or more: main effect first", right(half), at_least=0.92),
+        share("messy, half of the gap or more: first, or said to be not separable from the first",
+              [j.first_or_not_separable for j in half]),
         share("messy, half of the gap or more: place", [j.placed for j in half], at_least=0.96),
         share("messy, less than half of the gap: main effect first",
               right([j for j in rows["messy"] if j not in half])),

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The blind check of rigs as they are draws what it says, and each of its figures can fail."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from evaluation.blind import cases, changes, circumstances, folder, other_rigs, plant
@@ -101,6 +103,9 @@ def test_each_figure_of_the_circumstances_can_fail():
                               ("messy: ghosts a recording", 0.0, 2.0),
                               ("messy: 95 % interval of the share holds the true share", 1.0, 0.0)):
         assert (good[name], bad[name]) == (best, worst), name
+    named = "messy, half of the gap or more: first, or said to be not separable from the first"
+    said = replace(wrong, answer=replace(wrong.answer, named=("brush_drop", "gust")))
+    assert (good[named], bad[named], values(said)[named]) == (1.0, 0.0, 1.0)
     nothing = "nothing missing: an effect or `unknown` claimed"
     assert values(judged("nothing missing", [], {}, "none", []))[nothing] == 0.0
     assert values(judged("nothing missing", [], {}, "unknown", []))[nothing] == 1.0
