@@ -371,7 +371,7 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
     share = gap_share.shares(parts)
     head = gap_share.headline(parts, share, settings.material)
     failed = found.failed or _why_not_predicted(chains, gaps)
-    if head.verdict == "none":
+    if head.verdict == "none" and not calibrated:
         failed = failed or gap_share.why_unsure(share, settings.material)
     if failed:
         head = gap_share.Headline(CANNOT_TELL, "none", [], [], set())

@@ -19,6 +19,7 @@ from aeropend_ident.diagnosis.search.findings import Findings, Selection
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
 from aeropend_ident.diagnosis.search.search import refit
+from aeropend_ident.diagnosis.search.selection import noise_over_spread
 from aeropend_ident.estimation.map_fit import Fit, fit
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.statistics import Z95, rms
@@ -39,10 +40,13 @@ WIDER = 1.2
 Measured: rigs simulated for the purpose (seeds 11 to 13 of `make blind`); intervals are judged on others."""
 
 
-AGAIN_ROUNDS = 2
-"""Rounds, of one step each, of a fit without one of the effects.
+AGAIN_STEPS = 4
+"""Steps of a fit without some of the effects (choice: it starts close to its end, and only its gap counts)."""
 
-Choice: it starts close to its end, and only its gap counts."""
+FREER = 30.0
+"""Factor on the priors' standard deviations in a fit without some of the effects: only their ends count.
+
+Choice: the finite differences are still small."""
 
 OTHER_SIZES = (0.6, 0.8, 1.25, 1.6)
 """Factors on the size of an effect from which a recording alone is fitted too (choice: swings have local minima)."""
@@ -86,18 +90,28 @@ class JointFit:
     checks: dict[str, Check]
 
     def without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
-        """The values that fit best without some of the effects; calibrated parameters stay within their priors."""
+        """The values that leave the smallest gap without some of the effects.
+
+        Calibrated parameters stay within their priors. What comes back is what no other parameter could take over.
+        """
         rest = {stage: replace(f, found=tuple(s for s in f.found if s[0].hypothesis not in effects))
                 for stage, f in self.findings.items()}
-        parameters = list(_parameters(self.chains, rest).values())
-        residuals = self.chains.joined(_free_run_residuals(self.chains))
+        parameters = [replace(p, sd=FREER * p.sd) for p in _parameters(self.chains, rest).values()]
+        free_run = self.chains.joined(_free_run_residuals(self.chains))
 
-        def misfit(start: Mapping[str, float]) -> float:
+        def residuals(values: dict[str, float]) -> dict[str, Array]:
+            """Residuals in units of the channel's spread, each channel as if it had as many readings as the longest."""
+            found = {k: np.asarray(r) for k, r in free_run(values).items()}
+            longest = max((len(r) for r in found.values()), default=0)
+            return {k: math.sqrt(longest / max(len(r), 1)) * noise_over_spread(self.chains, k) * r
+                    for k, r in found.items()}
+
+        def gap(start: Mapping[str, float]) -> float:
             begun = {p.name: p.begin for p in started(parameters, start)}
             return sum(float(np.sum(r * r)) for r in residuals(begun).values())
 
-        best = min((self.values, self._expected_without(effects)), key=misfit)
-        return fit(residuals, started(parameters, best), AGAIN_ROUNDS, 1).values
+        best = min((self.values, self._expected_without(effects)), key=gap)
+        return fit(residuals, started(parameters, best), 1, AGAIN_STEPS, math.inf).values
 
     def _expected_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         """The values without some of the effects if the readings were linear in all of them."""

@@ -325,18 +325,18 @@ class SelectionRound:
 
 def squared_gap(chains: CutChains, f: Fit, channels: Collection[str] = tuple(CHANNELS)) -> float:
     """What a fit leaves of some channels above the noise of the readings, in units of their squared spread."""
-    total = 0.0
-    for channel, r in f.residuals.items():
-        k = key(channel)
-        if k.name not in channels:
-            continue
-        s = chains.each[k.recording].signals
-        noise = s.sigma[k.name]
-        if k.name == "omega" and s.pulses:
-            noise = float(np.sqrt(np.mean(s.pulses.sigma[s.pulses.index < s.train] ** 2)))
-        spread = max(float(np.nanstd(s.channel(k.name)[:s.train])), noise)
-        total += max(float(np.mean(r * r)) - 1.0, 0.0) * (noise / spread) ** 2
-    return total
+    return sum(max(float(np.mean(r * r)) - 1.0, 0.0) * noise_over_spread(chains, channel) ** 2
+               for channel, r in f.residuals.items() if key(channel).name in channels)
+
+
+def noise_over_spread(chains: CutChains, channel: str) -> float:
+    """Noise of a reading of a channel, in units of the channel's standard deviation."""
+    k = key(channel)
+    s = chains.each[k.recording].signals
+    noise = s.sigma[k.name]
+    if k.name == "omega" and s.pulses:
+        noise = float(np.sqrt(np.mean(s.pulses.sigma[s.pulses.index < s.train] ** 2)))
+    return noise / max(float(np.nanstd(s.channel(k.name)[:s.train])), noise)
 
 
 def mean_square(f: Fit, stage: str) -> float:
