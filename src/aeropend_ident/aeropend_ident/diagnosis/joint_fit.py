@@ -101,10 +101,9 @@ class JointFit:
 
         def residuals(values: dict[str, float]) -> dict[str, Array]:
             """Residuals in units of the channel's spread, each channel as if it had as many readings as the longest."""
-            found = {k: np.asarray(r) for k, r in free_run(values).items()}
+            found = {k: np.asarray(r) for k, r in free_run(values).items() if len(r)}
             longest = max((len(r) for r in found.values()), default=0)
-            return {k: math.sqrt(longest / max(len(r), 1)) * noise_over_spread(self.chains, k) * r
-                    for k, r in found.items()}
+            return {k: math.sqrt(longest / len(r)) * noise_over_spread(self.chains, k) * r for k, r in found.items()}
 
         def gap(start: Mapping[str, float]) -> float:
             begun = {p.name: p.begin for p in started(parameters, start)}

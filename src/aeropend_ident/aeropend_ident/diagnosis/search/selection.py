@@ -326,7 +326,7 @@ class SelectionRound:
 def squared_gap(chains: CutChains, f: Fit, channels: Collection[str] = tuple(CHANNELS)) -> float:
     """What a fit leaves of some channels above the noise of the readings, in units of their squared spread."""
     return sum(max(float(np.mean(r * r)) - 1.0, 0.0) * noise_over_spread(chains, channel) ** 2
-               for channel, r in f.residuals.items() if key(channel).name in channels)
+               for channel, r in f.residuals.items() if len(r) and key(channel).name in channels)
 
 
 def noise_over_spread(chains: CutChains, channel: str) -> float:
