@@ -313,7 +313,7 @@ def _approximated(unknown: UnknownEffect, joint: JointFit, gaps: _Gaps, parts: S
 def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Findings:
     """Search effects, detect those that only statistics show, and judge whether one is unknown."""
     chains, recordings = fitted, fitted.recordings
-    stages = unsearched(fitted)
+    stages = unsearched(fitted) if fitted.policy.driven else {}
     trifle = trifling_gap(fitted, stages)
     if fitted.policy.wide_search:
         left = stages["arm"].base.residuals

@@ -93,11 +93,10 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
     after = held_out.gap_of(joint.values)
 
     def part(effects: Sequence[Hypothesis]) -> Part:
-        h, without = effects[0], held_out.gap_of(joint.without(effects))
-        size = h.own[0].name
+        size = effects[0].own[0].name
         distance = abs(joint.values[size] - neutral(held_out.model, size))
-        return Part(h.name, h.place, without.total**2 - after.total**2, _windows(without) - _windows(after),
-                    min(joint.sd[size] / max(distance, 1e-300), LARGEST_UNSURE))
+        return _coming_back(effects[0].name, effects[0].place, held_out.gap_of(joint.without(effects)), after,
+                            min(joint.sd[size] / max(distance, 1e-300), LARGEST_UNSURE))
 
     stages = [f.effects for f in joint.findings.values() if f.effects]
     with ThreadPoolExecutor(jobs) as pool:
@@ -124,8 +123,12 @@ def part_of_several(effects: Sequence[Hypothesis], joint: JointFit, held_out: He
         held_out: measures gaps.
         place: of the unknown effect.
     """
-    without, after = held_out.gap_of(joint.without(effects)), held_out.gap_of(joint.values)
-    return Part(UNKNOWN, place, without.total**2 - after.total**2, _windows(without) - _windows(after))
+    return _coming_back(UNKNOWN, place, held_out.gap_of(joint.without(effects)), held_out.gap_of(joint.values))
+
+
+def _coming_back(name: str, place: str, without: Gap, after: Gap, unsure: float = 0.0) -> Part:
+    """The part that comes back without some effects."""
+    return Part(name, place, without.total**2 - after.total**2, _windows(without) - _windows(after), unsure)
 
 
 def unexplained(after: Gap, floors: Mapping[str, float], random: RankedHypothesis | None, unknown: Repeatable | None
@@ -161,7 +164,8 @@ def unexplained(after: Gap, floors: Mapping[str, float], random: RankedHypothesi
 def part_of_spikes(spikes: RankedHypothesis, with_: Gap, without: Gap) -> Part:
     """The part of false captures: the gap of the nominal model with and without them."""
     h = spikes.hypothesis
-    return Part(h.name, h.place, max(with_.total**2 - without.total**2, 0.0), _windows(with_) - _windows(without))
+    part = _coming_back(h.name, h.place, with_, without)
+    return replace(part, amount=max(part.amount, 0.0))
 
 
 def shares(parts: Sequence[Part], seed: int = 0) -> dict[str, Interval]:

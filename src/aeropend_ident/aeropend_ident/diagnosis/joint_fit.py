@@ -98,12 +98,13 @@ class JointFit:
                 for stage, f in self.findings.items()}
         parameters = [replace(p, sd=FREER * p.sd) for p in _parameters(self.chains, rest).values()]
         free_run = self.chains.joined(_free_run_residuals(self.chains))
+        noise = {k: noise_over_spread(self.chains, k) for k, r in self.fit.residuals.items() if len(r)}
 
         def residuals(values: dict[str, float]) -> dict[str, Array]:
             """Residuals in units of the channel's spread, each channel as if it had as many readings as the longest."""
-            found = {k: np.asarray(r) for k, r in free_run(values).items() if len(r)}
+            found = {k: np.asarray(r) for k, r in free_run(values).items() if k in noise}
             longest = max((len(r) for r in found.values()), default=0)
-            return {k: math.sqrt(longest / len(r)) * noise_over_spread(self.chains, k) * r for k, r in found.items()}
+            return {k: math.sqrt(longest / len(r)) * noise[k] * r for k, r in found.items()}
 
         def gap(start: Mapping[str, float]) -> float:
             begun = {p.name: p.begin for p in started(parameters, start)}

@@ -285,7 +285,6 @@ def _delay_or_lag(best: Candidate, recordings: Sequence[Signals], keep: Collecti
     return (said,)
 
 
-
 def _without(c: Candidate, recordings: Sequence[Signals], effect: str) -> Candidate:
     model = c.model.with_effects({e: p for e, p in c.model.effects.items() if e != effect})
     m, f = _fitted(model, recordings, ROUNDS, STEPS)

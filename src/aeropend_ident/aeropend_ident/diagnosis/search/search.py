@@ -116,14 +116,10 @@ def unsearched(chains: CutChains) -> dict[str, Findings]:
 def trifling_gap(chains: CutChains, nominal: Mapping[str, Findings]) -> float:
     """The squared gap that is a trifle, compared with what the nominal structure leaves in all stages.
 
-    A decay has no other: what matters in its few swings is decided by the evidence.
-
     Args:
         chains: cut.
-        nominal: what `unsearched` returns.
+        nominal: what `unsearched` returns; nothing for a free decay, in whose few swings the evidence decides.
     """
-    if not chains.policy.driven:
-        return 0.0
     return TRIFLE * MATERIAL_SHARE * sum(squared_gap(chains, f.final, CHANNELS_OF[b]) for b, f in nominal.items())
 
 
@@ -141,7 +137,7 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
                   for b in others}
     known = nominal
     while len(findings.found) < MOST_EFFECTS:
-        here = SelectionRound(chains, stage, acts_on, downstream, known, findings, trifle, pool, deadline)
+        here = SelectionRound(chains, stage, acts_on, downstream, known, findings.final, trifle, pool, deadline)
         if chains.policy.driven and _explained(here):
             break
         if here.budget_spent:
@@ -178,7 +174,7 @@ def _select(here: SelectionRound, findings: Findings, candidates: list[Hypothesi
     ess = largest_ess([here.current, again])
     if again.log_evidence(ess) > here.current.log_evidence(ess) + BETTER_ALONE:
         findings = replace(findings, final=again, base=findings.base if findings.found else again)
-        here = replace(here, findings=findings)
+        here = replace(here, current=again)
         ranked = here.ranked(tried)
     best = ranked[0]
     matters = (best.hypothesis.parameter or at_end_of_prior(chains, here.stage, here.current)

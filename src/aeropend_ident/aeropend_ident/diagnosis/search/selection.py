@@ -21,7 +21,7 @@ from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD, absent, nominal_parameters
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
-from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis, Selection, adopted
+from aeropend_ident.diagnosis.search.findings import RankedHypothesis, Selection, adopted
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, from_linear, linear_parameters
 from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess, screen
@@ -85,7 +85,7 @@ class SelectionRound:
         acts_on: name of a hypothesis -> the stages whose residuals it changes.
         downstream: fits of the later stages that some hypothesis changes, without any.
         known: the parameters so far.
-        findings: of the stage so far.
+        current: their fit.
         trifle: squared gap that need not be closed.
         pool: threads.
         deadline: [s] of `time.monotonic` after which no further effect is searched; None: the budget decides.
@@ -96,15 +96,10 @@ class SelectionRound:
     acts_on: Mapping[str, tuple[str, ...]]
     downstream: Mapping[str, Fit]
     known: list[Parameter]
-    findings: Findings
+    current: Fit
     trifle: float
     pool: ThreadPoolExecutor
     deadline: float | None = None
-
-    @property
-    def current(self) -> Fit:
-        """The fit of the parameters so far."""
-        return self.findings.final
 
     @property
     def budget_spent(self) -> bool:
@@ -154,7 +149,7 @@ class SelectionRound:
         best = self._submit(lead, ROUNDS, begun=begun.values).result()
         rounds = self.chains.policy.screening_rounds
         again = [None if h is lead else self._submit(h, rounds, begun=best.values) for h, _ in tried]
-        return self._better(tried, [best if one is None else one.result() for one in again]), lead
+        return better(tried, [best if one is None else one.result() for one in again]), lead
 
     def converged(self, tried: FittedHypotheses, rounds: int = ROUNDS, *, but: Hypothesis | None = None
                   ) -> FittedHypotheses:
@@ -181,7 +176,7 @@ class SelectionRound:
         looks = [[w.result() for w in again(h)] if h in likeliest else [] for h, _ in tried]
         best = [max(fits, key=lambda f: f.log_likelihood, default=None) for fits in looks]
         work = [self._submit(h, ROUNDS, begun=b.values) if b else None for (h, _), b in zip(tried, best, strict=True)]
-        return self._better(tried, [w.result() if w else f for (_, f), w in zip(tried, work, strict=True)])
+        return better(tried, [w.result() if w else f for (_, f), w in zip(tried, work, strict=True)])
 
     def from_plain(self, candidates: list[Hypothesis], tried: FittedHypotheses) -> FittedHypotheses:
         """Fit from the nominal model without its further terms, if nothing tried explains all.
@@ -195,12 +190,12 @@ class SelectionRound:
         there = type(chains)(plain, chains.recordings, chains.policy)
         known = nominal_parameters(there, self.stage)
         base = fit(there.residuals(self.stage), known, least_ess=chains.policy.least_ess)
-        here = replace(self, chains=there, known=known, findings=replace(self.findings, final=base))
+        here = replace(self, chains=there, known=known, current=base)
         lead, best = min(here.converged(here.screened(candidates)), key=lambda item: item[1].mean_square)
         if best.mean_square > min(f.mean_square for _, f in tried):
             return tried
         ended = self._fit(lead, ROUNDS, 0, {**absent(self.known), **best.values})
-        return [(h, f) for h, f in tried if h.name != lead.name] + self._better(
+        return [(h, f) for h, f in tried if h.name != lead.name] + better(
             [(lead, ended)], [f for h, f in tried if h.name == lead.name] or [ended])
 
     def ranked(self, tried: FittedHypotheses) -> Selection:
@@ -247,11 +242,6 @@ class SelectionRound:
         later = {b: of(f, ess) for b, f in self.downstream.items()}
         return [of(f, ess) - of(self.current, ess)
                 - sum(later[b] for b in self.acts_on[h.name] if b != self.stage) for h, f in tried]
-
-    def _better(self, tried: FittedHypotheses, again: list[Fit]) -> FittedHypotheses:
-        """Each hypothesis with the better of its two fits, by evidence."""
-        ess = largest_ess([*again, *(f for _, f in tried)])
-        return [(h, max(f, g, key=lambda x: x.log_evidence(ess))) for (h, f), g in zip(tried, again, strict=True)]
 
     def _ranked_by_place(self, ranked: list[RankedHypothesis]) -> list[RankedHypothesis]:
         """Decide between close rivals at different places if none of them explains the whole misfit.
@@ -321,6 +311,12 @@ class SelectionRound:
         if inside:
             own[second] = min(max(own[second], reach * bounds.low), reach * bounds.high)
         return own
+
+
+def better(tried: FittedHypotheses, again: list[Fit]) -> FittedHypotheses:
+    """Each hypothesis with the better of its two fits, by evidence."""
+    ess = largest_ess([*again, *(f for _, f in tried)])
+    return [(h, max(f, g, key=lambda x: x.log_evidence(ess))) for (h, f), g in zip(tried, again, strict=True)]
 
 
 def squared_gap(chains: CutChains, f: Fit, channels: Collection[str] = tuple(CHANNELS)) -> float:

@@ -16,6 +16,7 @@ from aeropend_ident.diagnosis.policy import CERTAIN, GOOD_ENOUGH, MATERIAL_SHARE
 from aeropend_ident.diagnosis.search import speed_spikes
 from aeropend_ident.diagnosis.search.findings import Findings
 from aeropend_ident.diagnosis.search.free_curves import MissingTerm, missing_terms
+from aeropend_ident.diagnosis.search.selection import noise_over_spread
 from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.statistics import effective_sample_size
@@ -66,8 +67,7 @@ class Misfit:
 
     Attributes:
         square: mean square residual, in units of a reading's noise.
-        noise: standard deviation of a reading.
-        spread: standard deviation of the channel.
+        noise: standard deviation of a reading, in units of that of the channel.
         count: readings that were fitted.
         white: whether it is white noise.
         noticeable: mean square above which a misfit counts.
@@ -75,7 +75,6 @@ class Misfit:
 
     square: float
     noise: float
-    spread: float
     count: int
     white: bool
     noticeable: float
@@ -85,7 +84,7 @@ class Misfit:
         """Squared gap above the noise, in units of the spread squared; 0 if it passes as noise."""
         if self.white and self.square < GOOD_ENOUGH**2:
             return 0.0
-        shows = max(self.square - 1.0, 0.0) * (self.noise / self.spread) ** 2
+        shows = max(self.square - 1.0, 0.0) * self.noise**2
         return shows if self.square > self.noticeable + BY_CHANCE * math.sqrt(2.0 / self.count) else 0.0
 
     def remains(self, base: Misfit, kept: float) -> bool:
@@ -96,7 +95,7 @@ class Misfit:
             kept: share of it that may stay.
         """
         return (self.square > GOOD_ENOUGH**2 and self.square - 1.0 > kept * (base.square - 1.0)
-                and math.sqrt(self.square) * self.noise > VISIBLE * self.spread)
+                and math.sqrt(self.square) * self.noise > VISIBLE)
 
 
 Misfits = Mapping[str, Mapping[str, Misfit]]
@@ -164,11 +163,6 @@ def _placed(chains: CutChains, stage: str, base: Fit, known: list[Parameter]) ->
 
 
 def _misfit(chains: CutChains, channel: str, r: Array) -> Misfit:
-    name, k = key(channel).name, key(channel).recording
-    s = chains.each[k].signals
-    noise = s.sigma[name]
-    if name == "omega" and s.pulses:
-        noise = float(np.sqrt(np.mean(s.pulses.sigma[s.pulses.index < s.train] ** 2)))
-    spread = max(float(np.nanstd(s.channel(name)[:s.train])), noise)
     white = effective_sample_size(r) > WHITE * len(r)
-    return Misfit(float(np.mean(r * r)), noise, spread, len(r), white, chains.policy.unknown.noticeable)
+    return Misfit(float(np.mean(r * r)), noise_over_spread(chains, channel), len(r), white,
+                  chains.policy.unknown.noticeable)
