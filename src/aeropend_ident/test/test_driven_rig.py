@@ -126,3 +126,12 @@ def test_a_rest_at_the_end_is_left_out_and_one_between_is_not():
     assert end_of_motion(theta, duty, 0.001, 0.3) == pytest.approx(525, abs=2)
     assert end_of_motion(theta[:560], duty[:560], 0.001, 0.3) == 0
     assert end_of_motion(np.roll(theta, 400), np.roll(duty, 400), 0.001, 0.3) == 0
+
+
+@pytest.mark.promise("Uncalibrated rigs", "A thrust that falls more slowly than it rises is the rig's own model")
+def test_a_lag_that_differs_between_rise_and_fall_is_found():
+    s = driven({}, {"thrust_lag": {"tau": 0.1, "fall": 4.0}}, seconds=40.0)
+    body = diagnose(BENCH, [s], 2, fit_nominal=True).body
+    assert body["which"]["verdict"] == "none"
+    assert body["identified"]["own"]["thrust_lag.fall"]["value"] == pytest.approx(4.0, rel=0.3)
+    assert body["channels"]["theta"]["fit_unseen"] > 0.95

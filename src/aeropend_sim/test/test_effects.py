@@ -15,7 +15,7 @@ CONTRACT = {
     "bridge_drop": ("actuator", "v_drop V"), "supply_sag": ("actuator", "r_supply Ω"),
     "supply_drift": ("actuator", "rate 1/s"), "command_delay": ("actuator", "delay s"),
     "brush_drop": ("electrical", "v_brush V"), "winding_heating": ("electrical", "gain 1/A²s, tau s"),
-    "rotor_friction": ("rotor", "torque N·m"), "thrust_lag": ("thrust", "tau s"),
+    "rotor_friction": ("rotor", "torque N·m"), "thrust_lag": ("thrust", "tau s, fall -"),
     "thrust_exponent": ("thrust", "n -"), "axial_inflow": ("thrust", "k N·s²/rad²"),
     "ground_effect": ("thrust", "gain -, width rad"), "coulomb_friction": ("arm", "accel rad/s²"),
     "quadratic_drag": ("arm", "k 1/rad"), "cable_torque": ("arm", "k 1/s², theta0 rad"),

@@ -114,7 +114,7 @@ def test_missing_parameters_of_an_effect_take_the_defaults():
 
 
 def test_base_supplies_what_is_left_out():
-    base = load("bench").with_effects({"thrust_lag": {"tau": 0.2}})
+    base = load("bench").with_effects({"supply_sag": {"r_supply": 0.2}})
     model = from_flat({"model.R_a": 2.0}, base=base)
     assert model.model == {**base.model, "R_a": 2.0}
     assert model.effects == base.effects
@@ -140,8 +140,8 @@ def test_numbers_as_rcl_reads_them(tmp_path, written):
 
 def test_dotted_names_in_a_file(tmp_path):
     path = tmp_path / "m.yaml"
-    path.write_text(BENCH + "    effects.thrust_lag.tau: 0.1\n")
-    assert load(path).effects == {"thrust_lag": {"tau": 0.1}}
+    path.write_text(BENCH + "    effects.supply_sag.r_supply: 0.1\n")
+    assert load(path).effects == {"supply_sag": {"r_supply": 0.1}}
 
 
 AFTER_R_A = BENCH[:BENCH.index("R_a: ")].count("\n") + 2

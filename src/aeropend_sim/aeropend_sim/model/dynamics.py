@@ -122,6 +122,7 @@ class Extra(NamedTuple):
 
     cooling: Lag
     air: Lag
+    falling_air: Lag
     R_a: float
     R_total: float
     J_m: float
@@ -617,8 +618,9 @@ def advance_arm(state: State, wm: float, w1: float, c: Coefficients, e: Values |
     if e is None:
         return arm(Motion(state.theta, state.theta_dot, 0.0, 0.0), Over(f0, fm, f1), speed, 0.0, 0.0, c, e, x), f1
     if e.thrust_lag_tau > NO_LAG * c.h:
-        k = x.air
-        a = 1.0 / e.thrust_lag_tau
+        k, a = x.air, 1.0 / e.thrust_lag_tau
+        if e.thrust_lag_fall != 1.0 and fm < state.thrust:
+            k, a = x.falling_air, a / e.thrust_lag_fall
         s0, sm, s1 = a * f0, a * fm, a * f1
         f0 = state.thrust
         fm, f1 = (k.half_decay * f0 + k.u0 * s0 + k.u1 * sm + k.u2 * s1,
@@ -711,11 +713,11 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0
                      n["mgd_over_J"], n["c_over_J"], n["L_over_J"])
     if e is None:
         return c, None, None
-    air = lag(1.0 / e.thrust_lag_tau if e.thrust_lag_tau > NO_LAG * h else 0.0, h)
+    rise = 1.0 / e.thrust_lag_tau if e.thrust_lag_tau > NO_LAG * h else 0.0
     gust_decay = math.exp(-period / e.gust_tau)
-    return c, e, Extra(lag(1.0 / e.winding_heating_tau, h), air, n["R_a"], resistance, n["J_m"],
-                       gust_decay, e.gust_sigma * math.sqrt(1.0 - gust_decay**2), 1.0 / (1.0 - e.mast_flex_coupling),
-                       1.0 / e.ground_effect_width)
+    return c, e, Extra(lag(1.0 / e.winding_heating_tau, h), lag(rise, h), lag(rise / e.thrust_lag_fall, h), n["R_a"],
+                       resistance, n["J_m"], gust_decay, e.gust_sigma * math.sqrt(1.0 - gust_decay**2),
+                       1.0 / (1.0 - e.mast_flex_coupling), 1.0 / e.ground_effect_width)
 
 
 class Trajectory(NamedTuple):

@@ -29,6 +29,7 @@ class EffectParameter:
         low: smallest value.
         high: greatest value.
         description: its meaning.
+        refines: whether it refines the effect, which is usually complete with the neutral value.
     """
 
     unit: str
@@ -37,6 +38,7 @@ class EffectParameter:
     low: float
     high: float
     description: str
+    refines: bool = False
 
 
 @dataclass(frozen=True)
@@ -82,8 +84,11 @@ _ENTRIES = (
             "tau": P("s", 30.0, 30.0, 1.0, 600.0, "time constant of cooling")}),
     Effect("rotor_friction", "rotor", "Coulomb torque on the rotor, with sticking",
            {"torque": P("N·m", 0.0, 5e-4, 0.0, 2e-2, "friction torque")}),
-    Effect("thrust_lag", "thrust", "the thrust lags behind its static value: ḟ = (f_static - f)/tau",
-           {"tau": P("s", 0.0, 0.08, 0.0, 1.0, "time constant of the thrust")}),
+    Effect("thrust_lag", "thrust",
+           "the thrust lags behind its static value: ḟ = (f_static - f)/tau, /(fall tau) downwards",
+           {"tau": P("s", 0.0, 0.08, 0.0, 1.0, "time constant of the thrust while it rises"),
+            "fall": P("-", 1.0, 1.0, 0.1, 10.0, "time constant while the thrust falls, over that while it rises",
+                      refines=True)}),
     Effect("thrust_exponent", "thrust",
            "the thrust is not quadratic in the speed: f = k_thrust ω_0² (ω/ω_0)^n, ω_0 = 150 rad/s",
            {"n": P("-", 2.0, 1.8, 1.0, 3.0, "exponent of the speed")}),

@@ -23,7 +23,9 @@ from aeropend_ident.diagnosis.chain.priors import (
     FINDINGS,
     POWERS,
     REFERENCE_GRAVITY,
+    held,
     nominal_parameters,
+    refines,
     usual_size,
 )
 from aeropend_ident.diagnosis.chain.values import FILTER, of_rig, with_values
@@ -144,7 +146,7 @@ def fit_driven_rig(model: Model, recordings: Sequence[Signals]) -> DrivenRig:
     units = units_of(model, recordings)
     scaled = [downsampled(units.of(s), dynamics.LONGEST_STEP) for s in recordings]
     full, plain = _searched(units.model(model), scaled, keep=model.effects)
-    chosen = _chosen(full, scaled, keep=model.effects)
+    chosen = _refined(units.model(model), _chosen(full, scaled, model.effects), scaled, model.effects)
     found = units.model(chosen.model, back=True)
     f = fit_own(found, recordings)
     return DrivenRig(with_values(found, of_rig(f.values)), _rescaled(units.model(plain, back=True), found),
@@ -227,7 +229,7 @@ def _searched(model: Model, recordings: Sequence[Signals], keep: Collection[str]
             begun.append(_over_growing_horizons(list(best.values()), recordings))
     plain = _fitted(begun[0] if starts[0] else model, recordings, ROUNDS, STEPS)[0]
     begun = [plain, *begun[1 if starts[0] else 0:]]
-    full = [with_values(m, {n: _first_size(n, m) for n in CHOSEN if key(n).owner not in m.effects}) for m in begun]
+    full = [_with_terms(m, [n for n in CHOSEN if not refines(n)]) for m in begun]
     m, f = min((_fitted(m, recordings, ROUNDS, STEPS) for m in full), key=lambda e: e[1].mean_square)
     return Candidate(m, f, _error(m, recordings, f)), plain
 
@@ -242,26 +244,54 @@ def _over_growing_horizons(begun: list[Model], recordings: Sequence[Signals]) ->
     return begun[0]
 
 
+def _usual(name: str, m: Model) -> tuple[float, float]:
+    """The value at which a term is absent, and by how much it usually differs from it."""
+    k = key(name)
+    p = CATALOGUE[k.owner].parameters[k.name]
+    return p.neutral, 1.0 if p.refines else usual_size(k.owner, m) - p.neutral
+
+
 def _first_size(name: str, m: Model) -> float:
     """The size of a term from which a fit with every term starts."""
-    effect = key(name).owner
-    absent = CATALOGUE[effect].parameters[key(name).name].neutral
-    return absent + FIRST_SIZE * (usual_size(effect, m) - absent)
+    absent, usual = _usual(name, m)
+    return absent + FIRST_SIZE * usual
+
+
+def _with_terms(m: Model, names: Sequence[str]) -> Model:
+    """A model with the terms that it lacks, at the sizes from which a fit starts."""
+    return with_values(m, {n: _first_size(n, m) for n in names if key(n).owner not in m.effects or refines(n)})
+
+
+def _refined(model: Model, best: Candidate, recordings: Sequence[Signals], keep: Collection[str]) -> Candidate:
+    """Add what refines a term, with that term, where a cross-validated free run needs it.
+
+    All else is then searched again: without it, the static curve had to stand in for it.
+    """
+    for name in filter(refines, CHOSEN):
+        owner = key(name).owner
+        terms = [f"{owner}.{CATALOGUE[owner].size}", name]
+        if owner in keep:
+            continue
+        tried = _candidate(_with_terms(best.model, terms), recordings)
+        if best.error > NEEDED * tried.error and not any(_absent(tried, term) for term in terms):
+            begun = model.with_effects({**model.effects, owner: tried.model.effects[owner]})
+            again = _chosen(_searched(begun, recordings, keep)[0], recordings, keep)
+            best = min(tried, again, key=lambda c: c.error)
+    return best
 
 
 def _absent(c: Candidate, name: str) -> bool:
     """Whether a term has ended at the size at which it is absent."""
-    effect = key(name).owner
-    absent = CATALOGUE[effect].parameters[key(name).name].neutral
-    return abs(c.model.effect(effect, key(name).name) - absent) < NOTHING * abs(usual_size(effect, c.model) - absent)
+    absent, usual = _usual(name, c.model)
+    return abs(c.model.effect(key(name).owner, key(name).name) - absent) < NOTHING * abs(usual)
 
 
 def _chosen(best: Candidate, recordings: Sequence[Signals], keep: Collection[str]) -> Candidate:
     """Take out the terms that a cross-validated free run does not need, the least needed first."""
     while True:
-        terms = [name for name in CHOSEN if key(name).owner in best.model.effects and key(name).owner not in keep]
+        terms = [name for name in held(best.model) if key(name).owner not in keep]
         gone = [name for name in terms if _absent(best, name)]
-        fewer = [_without(best, recordings, key(name).owner) for name in gone[:1] or terms]
+        fewer = [_without(best, recordings, name) for name in gone[:1] or terms]
         simpler = min(fewer, key=lambda c: c.error, default=None)
         if simpler is None or (simpler.error > NEEDED * best.error and not gone):
             return best
@@ -285,8 +315,16 @@ def _delay_or_lag(best: Candidate, recordings: Sequence[Signals], keep: Collecti
     return (said,)
 
 
-def _without(c: Candidate, recordings: Sequence[Signals], effect: str) -> Candidate:
-    model = c.model.with_effects({e: p for e, p in c.model.effects.items() if e != effect})
+def _without(c: Candidate, recordings: Sequence[Signals], name: str) -> Candidate:
+    k = key(name)
+    absent, _ = _usual(name, c.model)
+    effects = {e: p for e, p in c.model.effects.items() if e != k.owner or CATALOGUE[e].size != k.name}
+    if k.owner in effects:
+        effects[k.owner] = {**effects[k.owner], k.name: absent}
+    return _candidate(c.model.with_effects(effects), recordings)
+
+
+def _candidate(model: Model, recordings: Sequence[Signals]) -> Candidate:
     m, f = _fitted(model, recordings, ROUNDS, STEPS)
     return Candidate(m, f, _error(m, recordings, f))
 

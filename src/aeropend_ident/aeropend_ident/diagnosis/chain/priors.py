@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from aeropend_ident.diagnosis.chain.chain import DELAY, CutChains
-from aeropend_ident.diagnosis.chain.values import FILTER, STAGES
+from aeropend_ident.diagnosis.chain.values import FILTER, STAGES, neutral
 from aeropend_ident.diagnosis.policy import angle_only, free_swinging
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.signals import STILL, Signals
@@ -78,8 +78,14 @@ STRAIGHT = 2.0
 REFERENCE_GRAVITY = 33.8
 """[1/s²] `mgd_over_J` of the rig for which the catalogue's default sizes matter (convention: config/bench.yaml)."""
 
-CHOSEN = (ZERO, "coulomb_friction.accel", "command_delay.delay", "thrust_lag.tau", "thrust_exponent.n")
-"""Sizes of effects that the nominal model of a rig with angle and command alone is identified with if it needs them."""
+CHOSEN = (ZERO, "coulomb_friction.accel", "command_delay.delay", "thrust_lag.tau", "thrust_lag.fall",
+          "thrust_exponent.n")
+"""Parameters of effects that the nominal model of a rig with angle and command alone is identified with if needed."""
+
+RATIO_SD = 0.7
+"""Standard deviation of the logarithm of a ratio that refines an effect, whose neutral value is 1.
+
+Derived: a factor of four is two standard deviations, ln(4)/2."""
 
 FINDINGS = ("coulomb_friction",)
 """Effects that are identified with the nominal model but reported as missing in it (choice: as in a free decay)."""
@@ -182,7 +188,7 @@ def _of_angle(model: Model, recordings: Sequence[Signals]) -> list[Parameter]:
            Parameter("c_over_J", m["c_over_J"], max(m["c_over_J"], 0.3 / slower), 0.0, 1e3)]
     if free_swinging(recordings):
         return [*arm, Parameter(ZERO, model.effect("angle_offset", "bias"), 0.3)]
-    own = [_of_effect(name, model) for name in CHOSEN if key(name).owner in model.effects]
+    own = [_of_effect(name, model) for name in held(model)]
     full = max(float(actuator.voltage(m, max(float(s.duty.max()) for s in recordings))), LEAST_VOLTAGE)
     heaviest = HEAVIEST * (1.0 + HEAVIEST) * m["K_e"] ** 2 * m["K_t"] / (m["R_a"] * full)
     quickest = max(QUICKEST * slower, 0.6 * max(s.period for s in recordings)) * m["K_t"] * m["K_e"] / m["R_a"]
@@ -198,9 +204,23 @@ def absent(parameters: Sequence[Parameter]) -> dict[str, float]:
     return {k.plain: CATALOGUE[k.owner].parameters[k.name].neutral for k in names if k.owner in CATALOGUE}
 
 
+def held(model: Model) -> list[str]:
+    """The parameters of `CHOSEN` that a nominal model holds."""
+    return [name for name in CHOSEN if key(name).owner in model.effects
+            and not (refines(name) and model.effect(key(name).owner, key(name).name) == neutral(model, name))]
+
+
+def refines(name: str) -> bool:
+    """Whether a parameter of an effect refines it."""
+    return CATALOGUE[key(name).owner].parameters[key(name).name].refines
+
+
 def _of_effect(name: str, model: Model) -> Parameter:
-    """The size of an effect that the nominal model holds."""
+    """The size of an effect that the nominal model holds, or what refines it."""
     size = CATALOGUE[key(name).owner].parameters[key(name).name]
+    if size.refines:
+        start = model.effect(key(name).owner, key(name).name)
+        return Parameter(name, size.neutral, RATIO_SD, size.low, size.high, start, log=True)
     spread = SIZE_SD * abs(usual_size(key(name).owner, model) - size.neutral)
     return Parameter(name, model.effect(key(name).owner, key(name).name), spread,
                      0.0 if name == DELAY else size.low, size.high)

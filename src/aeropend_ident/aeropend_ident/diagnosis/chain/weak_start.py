@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from aeropend_ident.signals.signals import Signals
 from aeropend_ident.signals.smoothing import block_mean
+from aeropend_sim.compiled import njit
 from aeropend_sim.model import actuator, dynamics
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import Model
@@ -130,8 +131,6 @@ def curve(numbers: Mapping[str, float], dead: float, bend: float, load: float, l
 
 def unit_lift(model: Model, s: Signals) -> Array:
     """Thrust (N,) over k_thrust for a duty: the speed squared, unless an effect of the thrust changes that."""
-    from scipy.signal import lfilter  # its import is slow
-
     n = model.numbers()
     hangs = abs(float(np.mean(s.theta[np.isfinite(s.theta)][:3]))) < HANGS
     before = 0.0 if hangs else float(s.duty[0])
@@ -142,8 +141,19 @@ def unit_lift(model: Model, s: Signals) -> Array:
     pivot = dynamics.THRUST_PIVOT_SPEED
     u = pivot**2 * (np.maximum(out[1], 0.0) / pivot) ** model.effect("thrust_exponent", "n")
     tau = model.effect("thrust_lag", "tau")
-    keep = math.exp(-s.period / tau) if tau > 0.0 else 0.0
-    return lfilter([1.0 - keep], [1.0, -keep], u, zi=[keep * u[0]])[0] if keep else u
+    return _lagged(u, s.period, tau, tau * model.effect("thrust_lag", "fall")) if tau > 0.0 else u
+
+
+@njit()
+def _lagged(u: Array, period: float, rise: float, fall: float) -> Array:
+    """A series (N,) behind a first-order lag with time constants for rise and fall [s]."""
+    up, down = math.exp(-period / rise), math.exp(-period / fall)
+    out = np.empty_like(u)
+    now = u[0]
+    for k in range(len(u)):
+        now = u[k] + (up if u[k] > now else down) * (now - u[k])
+        out[k] = now
+    return out
 
 
 class WeakForm:

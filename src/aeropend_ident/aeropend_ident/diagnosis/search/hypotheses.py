@@ -123,7 +123,7 @@ def _starts(id_: str, model: Model) -> Iterable[tuple[Parameter, ...]]:
                      start=size.neutral + FIRST_SIZE * step)
     if id_ in STICKING:
         return [(head,), (replace(head, start=size.neutral + SMALLER * FIRST_SIZE * step),)]
-    others = [(name, p) for name, p in effect.parameters.items() if name != effect.size]
+    others = [(name, p) for name, p in effect.parameters.items() if name != effect.size and not p.refines]
     if not others:
         return [(head,)]
     grids: list[list[Parameter]] = []
