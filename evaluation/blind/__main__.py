@@ -24,7 +24,7 @@ from aeropend_ident.bags import recording
 from aeropend_ident.signals.from_bag import from_recording
 from aeropend_ident.testing import bags
 from aeropend_sim.model.parameters import load
-from evaluation.blind import cases, circumstances, folder, limit, page, peers, plant, report, score, uncalibrated
+from evaluation.blind import cases, circumstances, folder, limit, page, pairs, peers, plant, report, score, uncalibrated
 
 SPARSE, BIC = "sparse regression of the discrepancy (pysindy)", "stepwise BIC on output error"
 SHARES = {"single": 0.54, "none": 0.18, "two": 0.14, "outside": 0.14}
@@ -128,14 +128,22 @@ def main() -> None:
                         help="uncalibrated rigs: angle and command alone, and free decays")
     parser.add_argument("--circumstances", action="store_true",
                         help="rigs with many small imperfections, in closed loop, with wrong noise and lost samples")
+    parser.add_argument("--pairs", action="store_true",
+                        help="pairs of recordings of one rig between which something was changed, or nothing")
     parser.add_argument("--docs", action="store_true",
                         help="run nothing, write the table of the last run into docs/results")
     options = parser.parse_args()
     steps = options.steps.split(",")
     if options.docs:
         part, name = (("unknown", "uncalibrated") if options.uncalibrated else
-                      ("circumstances", "circumstances") if options.circumstances else ("", "blind"))
+                      ("circumstances", "circumstances") if options.circumstances else
+                      ("pairs", "pairs") if options.pairs else ("", "blind"))
         page.write(options.out / part, name)
+        return
+    if options.pairs:
+        out = options.out / "pairs"
+        out.mkdir(parents=True, exist_ok=True)
+        _save(out, pairs.report(options.count, options.seed, options.duration, options.jobs), options)
         return
     if options.circumstances or options.uncalibrated:
         _other_rigs(options, steps)

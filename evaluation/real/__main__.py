@@ -7,6 +7,8 @@ between the cells are semicolons. Example:
 
     name;rig;file;options;known
     monday;mine;monday.csv;--time t:s --theta angle:deg --duty pwm:%;the pivot is dry
+
+`make real ARGS="--drawn 20 --seed 5"` draws rigs that might lie on a desk instead; see `drawn_rigs`.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ import shlex
 import shutil
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -28,13 +30,15 @@ import numpy as np
 from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.commands import import_table
 from aeropend_ident.diagnosis.diagnosis import Diagnosis, diagnose
+from aeropend_ident.diagnosis.document import CANNOT_TELL
 from aeropend_ident.diagnosis.results import Results, document
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import Signals
 from aeropend_ident.tables.table import TableError
+from aeropend_ident.testing import bags
 from aeropend_sim.model.parameters import load
 from evaluation.blind.page import markdown
-from evaluation.real import grey_box
+from evaluation.real import drawn_rigs, grey_box
 
 FLAT = -1e5
 """[%] Fit below which the angle counts as flat: no model has a fit there (choice)."""
@@ -100,14 +104,37 @@ def rigs_of(folder: Path) -> list[Rig]:
 
 def row(rig: Rig, folder: Path, out: Path, *, peer: bool, jobs: int) -> Row:
     """Import a table, diagnose it, and fit the grey box to it."""
-    bag = out / "bags" / rig.name
-    started = time.monotonic()
-    none = Row(rig.name, rig.rig, rig.known, (), (), "", (), 0.0)
-    try:
+    def signals() -> Signals:
+        bag = out / "bags" / rig.name
         words = [str(folder / rig.file), str(bag), *shlex.split(rig.options)]
         import_table.run(import_table.parse(words), words)
-        model = load("bench")
-        signals = signals_of(bag, None, model.sensing, fit_nominal=True)
+        return signals_of(bag, None, load("bench").sensing, fit_nominal=True)
+
+    return judged(rig, signals, out, peer=peer, jobs=jobs)
+
+
+def drawn_row(seed: int, k: int, out: Path, *, peer: bool, jobs: int) -> Row:
+    """Diagnose a drawn rig, and fit the grey box to it."""
+    d = drawn_rigs.draw(np.random.default_rng([seed, k]))
+    known = ", ".join(f"{n} {v:.3g}" if isinstance(v, float) else f"{n} {v}" for n, v in d.about.items())
+    print(known, flush=True)
+
+    def signals() -> Signals:
+        bag = out / "bags" / f"drawn-{k}"
+        nothing = np.full(len(d.duty), np.nan)
+        bags.write(bag, {"theta": d.theta, "omega": nothing, "i_a": nothing, "v_a": nothing, "duty": d.duty},
+                   round(d.period * 1e9))
+        return signals_of(bag, None, load("bench").sensing, fit_nominal=True)
+
+    return judged(Rig(f"drawn-{k}", f"drawn-{k}", "", "", known), signals, out, peer=peer, jobs=jobs)
+
+
+def judged(rig: Rig, of: Callable[[], Signals], out: Path, *, peer: bool, jobs: int) -> Row:
+    """Diagnose a recording, and fit the grey box to it."""
+    none = Row(rig.name, rig.rig, rig.known, (), (), "", (), 0.0)
+    started, model = time.monotonic(), load("bench")
+    try:
+        signals = of()
         started = time.monotonic()
         found = diagnose(model, [signals], jobs, fit_nominal=True)
     except (RecordingError, TableError) as error:
@@ -141,10 +168,14 @@ def _said(found: Diagnosis) -> str:
 
 
 def contradicted(rows: Sequence[Row]) -> dict[str, list[str]]:
-    """Name -> effects claimed that another recording of the same rig shows neither as a claim nor in its own model."""
+    """Name -> effects claimed that another recording of the same rig shows neither as a claim nor in its own model.
+
+    A recording that cannot tell contradicts nothing.
+    """
     out = {}
     for r in rows:
-        others = [{*o.effects, *o.own} for o in rows if o.rig == r.rig and o is not r and o.fitted]
+        others = [{*o.effects, *o.own} for o in rows if o.rig == r.rig and o is not r and o.fitted
+                  and o.verdict != CANNOT_TELL]
         out[r.name] = [e for e in r.effects if others and not all(e in o for o in others)]
     return out
 
@@ -170,13 +201,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the table; returns the exit code."""
     parser = argparse.ArgumentParser(prog="real", description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path, help="folder with rigs.csv")
+    parser.add_argument("data", type=Path, nargs="?", help="folder with rigs.csv")
+    parser.add_argument("--drawn", type=int, metavar="N", help="so many drawn rigs in place of the folder")
+    parser.add_argument("--seed", type=int, default=1, help="of the drawn rigs (default: 1)")
     parser.add_argument("--out", type=Path, default=Path("real_results"), help="folder for the verdicts")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="these recordings")
     parser.add_argument("--no-peer", action="store_true", help="do not fit the grey box")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="threads")
     options = parser.parse_args(arguments)
-    chosen = [r for r in rigs_of(options.data) if not options.only or r.name in options.only]
+    if (options.data is None) == (options.drawn is None):
+        parser.error("give a folder with rigs.csv (DATA=folder), or --drawn N")
+    chosen = [] if options.data is None else [
+        r for r in rigs_of(options.data) if not options.only or r.name in options.only]
     options.out.mkdir(exist_ok=True)
     (options.out / ".gitignore").write_text("*\n", encoding="utf-8")
     shutil.rmtree(options.out / "bags", ignore_errors=True)
@@ -184,6 +220,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for rig in chosen:
         print(f"== {rig.name}: {rig.known}", flush=True)
         rows.append(row(rig, options.data, options.out, peer=not options.no_peer, jobs=options.jobs))
+        print(table(rows[-1:])[-1], flush=True)
+    for k in range(options.drawn or 0):
+        rows.append(drawn_row(options.seed, k, options.out, peer=not options.no_peer, jobs=options.jobs))
         print(table(rows[-1:])[-1], flush=True)
     print("\n".join(["", *table(rows)]))
     made: Mapping[str, object] = {"rows": [asdict(r) for r in rows]}

@@ -21,7 +21,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from aeropend_ident.bags.recording import RecordingError
-from aeropend_ident.diagnosis import batch, dask_cluster
+from aeropend_ident.diagnosis import batch, dask_cluster, since
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.document import Across
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
@@ -38,6 +38,7 @@ EXAMPLES = """examples:
   diagnose my_bag                                compare a recording with the preset 'bench'
   diagnose monday tuesday --model rig.yaml       several recordings of one rig, fitted together
   diagnose monday --test tuesday                 fit one recording, and test on another how far the gap closes
+  diagnose tuesday --since diagnosis_monday      what has changed since an earlier verdict of the rig (or several)
   diagnose --each rigs/* --out verdicts          recordings of different rigs: a verdict each, and a table
   diagnose --each rigs/* --dask tcp://host:8786  the same on a Dask cluster (pip install 'aeropend_ident[dask]')
   diagnose let_go --uncalibrated                 a rig without a model file; a free decay needs no command
@@ -58,7 +59,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--each", action="store_true",
                         help="the recordings are of different rigs: a verdict each in DIR/<name of the bag>, "
                              f"and a table in DIR/{batch.SUMMARY}")
-    parser.add_argument("--model", default="bench", metavar="PRESET|FILE",
+    parser.add_argument("--model", metavar="PRESET|FILE",
                         help=f"nominal model: {' or '.join(PRESETS)}, or a model file (default: bench)")
     parser.add_argument("--out", metavar="DIR",
                         help="folder for the results (default: diagnosis_<name of the bag>; with --each: diagnoses)")
@@ -75,6 +76,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--fit-nominal", "--uncalibrated", action="store_true",
                         help="the parameters of the rig are not known: identify its nominal model from the recordings "
                              "first; the command may be missing if the arm swings freely")
+    parser.add_argument("--since", action="append", default=[], metavar="DIR",
+                        help="folder of an earlier verdict of the rig, whose model is the nominal one: the verdict is "
+                             "what has changed; several show how far the rig differs from run to run")
     parser.add_argument("--material", type=between(0.0, 1.0, "a share"), default=MATERIAL_SHARE, metavar="SHARE",
                         help="share of the gap from which an effect is claimed; smaller ones are listed as small "
                              f"(default: {MATERIAL_SHARE:g})")
@@ -87,6 +91,11 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         parser.error("--dask needs --each: it distributes recordings of different rigs")
     if options.dask is not None and options.jobs is not None:
         parser.error("--dask uses all workers of the cluster: leave --jobs out")
+    for other in ("model", "fit_nominal", "each"):
+        if options.since and getattr(options, other):
+            parser.error(f"--since and --{other.replace('_', '-')} contradict each other: leave the second out"
+                         + (", the earlier verdict has the model of the rig" if other != "each" else ""))
+    options.model = options.model or "bench"
     if options.test and options.each:
         parser.error("--test needs recordings of one rig: leave --each out")
     for bag in options.test:
@@ -111,15 +120,21 @@ def run(options: argparse.Namespace, command: str) -> None:
     started = time.monotonic()
     out = Path(options.out or f"diagnosis_{folder_names(options.bags[:1], [batch.SUMMARY])[0]}")
     ensure_free(out, FILES, overwrite=options.overwrite)
-    model = load(options.model)
+    known, uncalibrated = None, options.fit_nominal
+    if options.since:
+        model, known, verdicts = since.read([Path(folder) for folder in options.since])
+        uncalibrated = verdicts[-1].identified is not None
+    else:
+        model = load(options.model)
     with progress("reading") as show:
         signals, tests = ([signals_of(bag, options.namespace, model.sensing, options.held_out,
-                                      fit_nominal=options.fit_nominal) for bag in bags]
+                                      fit_nominal=uncalibrated) for bag in bags]
                           for bags in (options.bags, options.test))
         found = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal, material=options.material,
-                         seconds=options.seconds, progress=lambda what, share: show(share, what))
+                         seconds=options.seconds, known=known, progress=lambda what, share: show(share, what))
         shown = [Across(bag, **vars(validate(found.model, found.augmented, s))) for bag, s in zip(options.test, tests)]
-        made = document(found, options.bags, options.model, time.monotonic() - started, shown)
+        nominal = " and ".join(options.since) or options.model
+        made = document(found, options.bags, nominal, time.monotonic() - started, shown)
         results = Results.of(found, made, command)
     results.write(out, overwrite=options.overwrite)
     print("\n".join(results.lines))

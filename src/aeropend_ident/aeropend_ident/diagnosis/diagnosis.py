@@ -17,11 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from aeropend_ident.diagnosis import conclude, gap_share, regions, typed_json
+from aeropend_ident.diagnosis import conclude, gap_share, regions, since, typed_json
 from aeropend_ident.diagnosis.chain import static_map
 from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.driven_rig import fit_driven_rig, fit_own, without_findings
+from aeropend_ident.diagnosis.chain.known import Known
 from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model
 from aeropend_ident.diagnosis.chain.pwm_timing import with_pwm_timing
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, PLACE_OF_PARAMETER, neutral, of_rig, with_values
@@ -101,7 +102,8 @@ Progress = Callable[[str, float], None]
 
 
 def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progress: Progress = lambda *_: None, *,
-             fit_nominal: bool = False, material: float = MATERIAL_SHARE, seconds: float | None = None) -> Diagnosis:
+             fit_nominal: bool = False, material: float = MATERIAL_SHARE, seconds: float | None = None,
+             known: Known | None = None) -> Diagnosis:
     """Find where a model and a rig differ, which effect causes it, and how far the gap closes.
 
     Args:
@@ -112,6 +114,7 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
         fit_nominal: whether the rig is uncalibrated: its parameters are known to a factor of three at best.
         material: share of the gap from which an effect is claimed.
         seconds: [s] that the search may take; None: a budget of simulations bounds it where it may be long.
+        known: what earlier verdicts of the rig know of the model; the verdict is then what has changed.
     """
     with threadpool_limits(1):  # the matrices are narrow: threads of the linear algebra would slow each other down
         policy = policy_of(recordings, fit_nominal=fit_nominal)
@@ -128,7 +131,7 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
             model, recordings = fit_nominal_model(model, recordings)
         kind = CutChains if policy.calibrated else CachedChains
         chains = with_pwm_timing(kind(model, recordings, policy))
-        chains.likely, chains.plain, chains.notes = likely, plain, notes
+        chains.likely, chains.plain, chains.notes, chains.known = likely, plain, notes, known
         return _diagnose(chains, Settings(jobs, material, seconds), progress)
 
 
@@ -237,7 +240,8 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     model, chains = found.chains.model, found.chains
     nominal = model if chains.policy.calibrated else with_values(model, of_rig(gaps.base))
     progress("done", 1.0)
-    return Diagnosis(nominal, _augmented(model, joint.values, found.statistical), found.recordings, gaps.runs_before,
+    measured = model if chains.policy.calibrated else replace(model, sensing=_own_sensing(model, found.recordings))
+    return Diagnosis(nominal, _augmented(measured, joint.values, found.statistical), found.recordings, gaps.runs_before,
                      gaps.runs_after, conclusions, found.misfit)
 
 
@@ -258,7 +262,9 @@ def _fitted_further(fitted: CutChains) -> CutChains:
     further = _further(s)
     note = (f"after {s.train * s.period:.1f} s the rig behaves otherwise than before: the fit goes on up to "
             f"{further * s.period:.1f} s, only the rest is held out")
-    return type(fitted)(fitted.model, [replace(s, train=further).noted(note)], fitted.policy)
+    longer = type(fitted)(fitted.model, [replace(s, train=further).noted(note)], fitted.policy)
+    longer.known = fitted.known
+    return longer
 
 
 def _further(s: Signals) -> int:
@@ -398,7 +404,9 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
                     tuple(head.small)),
         closure=Closure(gaps.before.total, gaps.after.total, gaps.before.total_floor(gaps.floors), closed, low, high,
                         budget=gaps.budget(gust=found.statistical.gust is not None)),
-        identified=None if calibrated else conclude.identified_model(chains, joint, rows))
+        identified=None if calibrated else conclude.identified_model(chains, joint, rows),
+        since=None if chains.known is None else since.changes(chains.known, joint, head.claimed),
+        estimates=None if failed else since.estimates(joint))
 
 
 def _why_not_predicted(chains: CutChains, gaps: _Gaps) -> str:
@@ -455,6 +463,16 @@ def _left(findings: Mapping[str, Findings], *, gust: bool) -> dict[str, float]:
                 name = key(channel).name
                 left[name] = max(left.get(name, 0.0), rms(r))
     return left
+
+
+def _own_sensing(model: Model, recordings: Sequence[Signals]) -> dict[str, float]:
+    """The measurement chain of a model with the noise that the recordings show; it holds their resolution."""
+    own = dict(model.sensing)
+    for channel, name in (("theta", "angle"), ("i_a", "current"), ("v_a", "voltage")):
+        seen = [s.sigma[channel] for s in recordings if s.has(channel)]
+        if seen:
+            own |= {f"{name}_noise": float(np.mean(seen)), f"{name}_lsb": 0.0}
+    return own
 
 
 def _augmented(model: Model, values: Mapping[str, float], statistical: Statistical) -> Model:

@@ -387,6 +387,59 @@ class Identified:
     own: Mapping[str, Interval] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Estimates:
+    """Estimates of the augmented model, for a later comparison (`diagnose --since`).
+
+    Attributes:
+        names: (P,) parameters of the model, of the measurement chain and of effects.
+        values: (P,) estimates, SI units.
+        covariance: (P, P) of the estimates.
+    """
+
+    names: tuple[str, ...]
+    values: tuple[float, ...]
+    covariance: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
+class Change:
+    """A parameter, of the model or of an effect, that has changed since earlier verdicts.
+
+    Attributes:
+        name: of the parameter; `effect.parameter` if it is that of an effect.
+        unit: of the values.
+        before: estimate of the earlier verdicts; null if the effect was not there.
+        after: estimate.
+        change: after minus before.
+        claimed: whether it makes a material share of the gap.
+    """
+
+    name: str
+    unit: str
+    before: Interval | None
+    after: Interval
+    change: Interval
+    claimed: bool
+
+
+@dataclass(frozen=True)
+class Since:
+    """What has changed since earlier verdicts.
+
+    Attributes:
+        verdicts: the earlier verdicts.
+        changes: what has changed.
+        unchanged: name -> change, over the value before, of a parameter that the recording shows to be as before.
+        not_shown: parameters of which this recording does not show whether they have changed.
+    """
+
+    verdicts: tuple[str, ...]
+    changes: tuple[Change, ...]
+    unchanged: Mapping[str, Interval]
+    not_shown: tuple[str, ...]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Conclusions:
     """What a diagnosis shows.
@@ -397,6 +450,8 @@ class Conclusions:
         which: which effect causes it.
         closure: how far it closes.
         identified: uncalibrated rigs only.
+        since: only where earlier verdicts were given.
+        estimates: of the augmented model; left out if no verdict could be found.
     """
 
     channels: Mapping[str, Channel]
@@ -404,6 +459,8 @@ class Conclusions:
     which: Which
     closure: Closure = field(metadata={"key": "shrink"})
     identified: Identified | None = None
+    since: Since | None = None
+    estimates: Estimates | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -423,6 +480,8 @@ class DiagnosisDocument:
         which: which effect causes it.
         closure: how far it closes.
         identified: uncalibrated rigs only.
+        since: what has changed, only where earlier verdicts were given.
+        estimates: of the augmented model; left out if no verdict could be found.
         notes: what is unusual in the data, as sentences.
         seconds: [s] time taken.
     """
@@ -439,6 +498,8 @@ class DiagnosisDocument:
     which: Which
     closure: Closure = field(metadata={"key": "shrink"})
     identified: Identified | None = None
+    since: Since | None = None
+    estimates: Estimates | None = None
     notes: tuple[str, ...]
     seconds: float
 

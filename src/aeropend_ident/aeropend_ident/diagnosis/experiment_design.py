@@ -285,7 +285,8 @@ def _directly(model: Model, first: Named, second: Named) -> str:
     """What to measure directly where no signal helps."""
     texts = []
     for name, values in (first, second):
-        effect, _, parameter = name.partition(":")
+        effect, _, parameters = name.partition(":")
+        parameter = parameters.partition("+")[0]
         if parameter:
             p, nominal = PARAMETERS[f"model.{parameter}"], model.model[parameter]
             unit = "" if p.unit == "-" else f" {p.unit}"

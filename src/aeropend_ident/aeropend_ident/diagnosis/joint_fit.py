@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis import free_run_gap
 from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains, difference
-from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD, nominal_parameters
+from aeropend_ident.diagnosis.chain.priors import nominal_parameters, nominal_sd
 from aeropend_ident.diagnosis.chain.values import neutral
 from aeropend_ident.diagnosis.policy import CERTAIN
 from aeropend_ident.diagnosis.search.findings import Findings, Selection
@@ -89,6 +89,11 @@ class JointFit:
     sd: dict[str, float]
     checks: dict[str, Check]
 
+    @property
+    def parameters(self) -> dict[str, Parameter]:
+        """All parameters by name: of the nominal model, and of the effects found."""
+        return _parameters(self.chains, self.findings)
+
     def without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         """The values that leave the smallest gap without some of the effects.
 
@@ -115,7 +120,7 @@ class JointFit:
 
     def _expected_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         """The values without some of the effects if the readings were linear in all of them."""
-        every = _parameters(self.chains, self.findings)
+        every = self.parameters
         names = list(self.fit.values)
         z = np.array([every[n].to_standard(self.values[n]) for n in names])
         gone = [names.index(h.own[0].name) for h in effects]
@@ -207,7 +212,6 @@ def _with_run_to_run(chains: CutChains, findings: Mapping[str, Findings], joint:
 
 
 def _parameters(chains: CutChains, findings: Mapping[str, Findings]) -> dict[str, Parameter]:
-    """All parameters by name: of the nominal model, and of the effects found."""
     parameters: dict[str, Parameter] = {}
     for stage, f in findings.items():
         parameters.update({p.name: p for p in nominal_parameters(chains, stage)})
@@ -274,9 +278,10 @@ def _least_certain(chains: CutChains, findings: Mapping[str, Findings], joint: F
         for selection in f.found:
             size = selection[0].hypothesis.own[0].name
             contradicted = sd[size] > WIDER * joint.sd[size]  # recordings differ by more than their uncertainty
-            if selection[0].gain > CERTAIN and not selection[0].hypothesis.parameter and not contradicted:
+            off = selection[0].hypothesis.parameter and chains.known is None
+            if selection[0].gain > CERTAIN and not off and not contradicted:
                 continue  # its existence is certain; only its size and those of other values cannot be separated
-            spread = max(sd[size], NOMINAL_SD * abs(model.model[size]) if size in model.model else 0.0)
+            spread = max(sd[size], nominal_sd(chains, size))
             certain.append((abs(values[size] - neutral(model, size)) / spread, stage, selection))
     worst = min(certain, key=lambda c: c[0], default=None)
     return worst[1:] if worst is not None and worst[0] < SURE else None

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from aeropend_ident.diagnosis import since
 from aeropend_ident.diagnosis.diagnosis import Diagnosis
 from aeropend_ident.diagnosis.document import (
     CANNOT_TELL,
@@ -103,6 +104,7 @@ def document(diagnosis: Diagnosis, bags: Sequence[str], model: str, seconds: flo
         samples=sum(s.samples for s in signals), train_s=(0.0, round(train, 3)),
         held_out_s=(round(train, 3), round(duration, 3)), channels=c.channels, where=c.where, which=c.which,
         closure=replace(c.closure, across=tuple(across)), identified=c.identified,
+        since=c.since, estimates=c.estimates,
         notes=tuple(note for s in signals for note in s.notes), seconds=round(seconds, 2))
 
 
@@ -129,6 +131,8 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
         lines.append(f"  next: {experiment(which.next_experiment)}")
     if document.identified is not None:
         lines.append(f"  {identified_line(document.identified, which.numbers)}")
+    if document.since is not None:
+        lines += since.lines(document.since)
     lines.append(gap_line("gap on held-out data", closure))
     if (angle := document.channels.get("theta")) is not None:
         lines.append(f"  fit of the angle in a free run: {_percent(angle.fit_fitted)} % on the fitted part, "

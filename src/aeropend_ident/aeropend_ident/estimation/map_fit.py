@@ -3,11 +3,12 @@
 
 With residuals r_c (in units of a reading's noise) of channels c, and parameters z in standard units, the fit minimises
 
-    sum_c  (ess_c / n_c) * sum(r_c ** 2) / s_c ** 2  +  sum(z ** 2)
+    sum_c  (ess_c / n_c) * sum(r_c ** 2) / s_c ** 2  +  z' P z
 
 - s_c >= 1 inflates the noise to the RMS of the residual: a model that does not fit cannot claim a precise fit.
 - ess_c <= n_c is the effective sample size: a coloured residual holds less information than its samples.
-- The prior (z standard normal) keeps parameters from moving far to stand in for a missing effect.
+- The prior (z standard normal; P the inverse of its correlations) keeps parameters from moving far to stand in for a
+  missing effect.
 - A parameter that is pushed against its bound is left out of a step.
 
 Both weights are renewed as the fit goes on. Fits are compared by their log evidence in Laplace's approximation: log
@@ -80,6 +81,7 @@ class Fit:
         ess: channel -> effective sample size of the residual.
         log_prior: log density of the estimate under the prior, up to a constant.
         products: products of the sensitivities of each channel.
+        prior: information matrix (P, P) of the prior.
     """
 
     values: dict[str, float]
@@ -89,6 +91,7 @@ class Fit:
     ess: dict[str, float]
     log_prior: float
     products: Products
+    prior: Array
 
     @property
     def mean_square(self) -> float:
@@ -114,7 +117,7 @@ class Fit:
 
     def information(self, ess: Mapping[str, float]) -> Array:
         """Information matrix (P, P) of the parameters in standard units, prior included; `ess` as in `log_evidence`."""
-        information = np.eye(len(self.values))
+        information = self.prior.copy()
         for channel, (by, products) in self.products.items():
             weight = ess[channel] / len(self.residuals[channel]) / self.scale[channel] ** 2
             information[np.ix_(by, by)] += weight * products
@@ -123,7 +126,7 @@ class Fit:
 
 def estimate(values: dict[str, float], sd: dict[str, float]) -> Fit:
     """A fit that was not made by `fit`: estimates and standard deviations alone."""
-    return Fit(values, sd, {}, {}, {}, 0.0, {})
+    return Fit(values, sd, {}, {}, {}, 0.0, {}, np.eye(len(values)))
 
 
 def largest_ess(fits: Iterable[Fit]) -> dict[str, float]:
@@ -198,6 +201,7 @@ class Search:
         self.high = np.array([p.to_standard(p.high) for p in parameters])
         self.z = np.array([p.to_standard(p.begin) for p in parameters])
         self.z = np.clip(self.z, self.low, self.high)
+        self.prior = prior_information(parameters)
         self.current = self.at(self.z)
         self.slopes: dict[str, Sensitivities] = {}
         self.fresh = False
@@ -263,7 +267,7 @@ class Search:
 
     def normal_equations(self, slopes: Mapping[str, Sensitivities]) -> tuple[Array, Array, Products]:
         """Information matrix (P, P) and gradient (P,) of half the cost, prior included; and what `Fit` keeps."""
-        information, gradient = np.eye(len(self.z)), self.z.copy()
+        information, gradient = self.prior.copy(), self.prior @ self.z
         products: dict[str, tuple[NDArray[np.intp], Array]] = {}
         for k, s in slopes.items():
             of_all = s.rows @ s.rows.T
@@ -290,13 +294,13 @@ class Search:
             Information matrix and products of the last `normal_equations`.
         """
         damping = DAMPING
-        information, products = np.eye(len(self.z)), Products()
+        information, products = self.prior, Products()
         for _ in range(steps):
             if not self.slopes:
                 self.slopes, self.fresh = self.differences(), True
             r = self.stack(self.current)
             information, gradient, products = self.normal_equations(self.weighted(self.slopes))
-            cost = float(r @ r + self.z @ self.z)
+            cost = float(r @ r + self.z @ self.prior @ self.z)
             gained = expected = 0.0
             free = self.free(self.z, gradient)
             step = np.zeros(len(self.z))
@@ -306,7 +310,7 @@ class Search:
                 z = np.clip(self.z + step, self.low, self.high)
                 trial = self.at(z)
                 r = self.stack(trial)
-                new = float(r @ r + z @ z)
+                new = float(r @ r + z @ self.prior @ z)
                 if np.isfinite(new) and new < cost:
                     gained, moved = cost - new, z - self.z
                     expected = -float(moved @ (2.0 * gradient + information @ moved))
@@ -326,6 +330,20 @@ class Search:
         return information, products
 
 
+def prior_information(parameters: Sequence[Parameter]) -> Array:
+    """Information matrix (P, P) of the prior in standard units: the inverse of the correlations.
+
+    Two parameters are correlated if both state it: one that replaces another is not.
+    """
+    stated = {(p.name, other): value for p in parameters for other, value in p.correlation}
+    correlations = np.eye(len(parameters))
+    for j, p in enumerate(parameters):
+        for k, q in enumerate(parameters[:j]):
+            if (p.name, q.name) in stated and (q.name, p.name) in stated:
+                correlations[j, k] = correlations[k, j] = stated[p.name, q.name]
+    return np.asarray(np.linalg.inv(correlations))
+
+
 def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter],
         rounds: int = 10, steps: int = 4, least_ess: float = 0.0) -> Fit:
     """MAP fit with the noise inflated to the residual; see the module.
@@ -339,7 +357,7 @@ def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence
             one; with wide priors the search would then stay near their means.
     """
     search = Search(residuals, parameters, least_ess)
-    information, products = np.eye(len(search.z)), Products()
+    information, products = search.prior, Products()
     for _ in range(rounds):
         information, products = search.improve(steps)
         before = search.weight
@@ -351,7 +369,8 @@ def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence
     values = {p.name: p.value(x) for p, x in zip(parameters, z, strict=True)}
     sd = {p.name: abs(p.slope(x)) * float(np.sqrt(v)) for p, x, v in zip(parameters, z, np.diag(covariance),
                                                                          strict=True)}
-    return Fit(values, sd, search.current, search.scale, search.ess, -0.5 * float(z @ z), products)
+    log_prior = 0.5 * float(np.linalg.slogdet(search.prior)[1] - z @ search.prior @ z)
+    return Fit(values, sd, search.current, search.scale, search.ess, log_prior, products, search.prior)
 
 
 def screen(residuals: Callable[[dict[str, float]], Residuals], base: Fit, known: Sequence[Parameter],
@@ -372,7 +391,7 @@ def screen(residuals: Callable[[dict[str, float]], Residuals], base: Fit, known:
     r = search.stack(search.current)
     slopes = search.jacobian()
     information, gradient, _ = search.normal_equations(slopes)
-    cost = float(r @ r + search.z @ search.z)
+    cost = float(r @ r + search.z @ search.prior @ search.z)
     left = []
     for group in additions:
         values = {**base.values, **{p.name: p.begin for p in group}}

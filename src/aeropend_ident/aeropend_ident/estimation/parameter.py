@@ -62,6 +62,7 @@ class Parameter:
         high: upper bound.
         start: where a search starts; None: at the mean.
         log: whether the prior is log-normal.
+        correlation: (name, correlation) of other parameters with which the prior is correlated, in standard units.
     """
 
     name: str
@@ -71,6 +72,7 @@ class Parameter:
     high: float = np.inf
     start: float | None = None
     log: bool = False
+    correlation: tuple[tuple[str, float], ...] = ()
 
     @property
     def begin(self) -> float:

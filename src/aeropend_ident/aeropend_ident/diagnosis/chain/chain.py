@@ -17,6 +17,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from aeropend_ident.diagnosis.chain.known import Known
 from aeropend_ident.diagnosis.chain.values import STAGES, Values, with_values, without_effects
 from aeropend_ident.diagnosis.policy import CALIBRATED, Policy
 from aeropend_ident.estimation.parameter import key
@@ -265,6 +266,7 @@ class CutChains:
         self.model, self.policy = model, policy
         self.likely: Mapping[str, float] = {}  # sizes of effects with which the parameters were identified
         self.plain: Model | None = None  # the best nominal model without further terms, of a driven rig
+        self.known: Known | None = None  # what earlier verdicts know of the rig
         self.notes: tuple[str, ...] = ()  # what the recordings do not tell of the nominal model of a driven rig
         self.each = [self._cut(signals) for signals in recordings]
 

@@ -365,7 +365,7 @@ def _error_of_block(search: Search, slopes: Mapping[str, Sensitivities], informa
     z, now = search.z, search.current
     cost = _cost_without(search, z, now, channel, block)
     for _ in range(MOST_STEPS):
-        gradient = z.copy()
+        gradient = search.prior @ z
         for k, s in slopes.items():
             r = search.weight[k] * now[k]
             if k == channel:
@@ -393,7 +393,7 @@ def _cost_without(search: Search, z: Array, residuals: Mapping[str, Array], chan
                   ) -> float:
     own = search.weight[channel] * residuals[channel][block]
     every = search.stack(residuals)
-    return float(every @ every - own @ own + z @ z)
+    return float(every @ every - own @ own + z @ search.prior @ z)
 
 
 def lift(model: Model, recordings: Sequence[Signals]) -> Lift:

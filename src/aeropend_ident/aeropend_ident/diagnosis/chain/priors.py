@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from aeropend_ident.diagnosis.chain.chain import DELAY, CutChains
-from aeropend_ident.diagnosis.chain.values import FILTER, STAGES, neutral
+from aeropend_ident.diagnosis.chain.values import FILTER, STAGES, absent_at
 from aeropend_ident.diagnosis.policy import angle_only, free_swinging
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.signals import STILL, Signals
@@ -113,6 +113,8 @@ def model_parameters(chains: CutChains, stage: str) -> list[Parameter]:
         stages.append("motor")
     if "motor" in stages and any(not s.has("v_a") for s in recordings):
         stages.append("actuator")
+    if chains.known is not None:
+        return chains.known.parameters(stages, OUTSIDE)
     for name in (n for b in stages for n in STAGES[b]):
         nominal, p = chains.model.model[name], PARAMETERS[f"model.{name}"]
         if nominal > 0.0 and not calibrated:
@@ -130,6 +132,13 @@ def model_parameters(chains: CutChains, stage: str) -> list[Parameter]:
     if stage == "arm":
         parameters.append(_filter(chains.model))
     return _of_each(parameters, len(recordings))
+
+
+def nominal_sd(chains: CutChains, name: str) -> float:
+    """Standard deviation to which a parameter of a calibrated rig is known."""
+    if chains.known is not None:
+        return chains.known.sd(name)
+    return NOMINAL_SD * abs(chains.model.model[name]) if name in chains.model.model else 0.0
 
 
 def _filter(model: Model) -> Parameter:
@@ -207,7 +216,7 @@ def absent(parameters: Sequence[Parameter]) -> dict[str, float]:
 def held(model: Model) -> list[str]:
     """The parameters of `CHOSEN` that a nominal model holds."""
     return [name for name in CHOSEN if key(name).owner in model.effects
-            and not (refines(name) and model.effect(key(name).owner, key(name).name) == neutral(model, name))]
+            and not (refines(name) and model.effect(key(name).owner, key(name).name) == absent_at(name))]
 
 
 def refines(name: str) -> bool:

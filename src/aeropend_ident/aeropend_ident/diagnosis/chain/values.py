@@ -62,12 +62,17 @@ def without_effects(values: Values, model: Model) -> dict[str, float]:
     return {n: v for n, v in values.items() if key(n).owner not in CATALOGUE or key(n).owner in model.effects}
 
 
+def absent_at(name: str) -> float:
+    """The value of a parameter of an effect at which the effect is absent."""
+    return CATALOGUE[key(name).owner].parameters[key(name).name].neutral
+
+
 def neutral(model: Model, name: str) -> float:
-    """The value at which an effect is absent, or a parameter is nominal."""
+    """The value of a parameter in the nominal model; that of an effect which the model lacks is the one without it."""
     k = key(name)
     if k.owner == "sensing":
         return model.sensing[k.name]
-    return CATALOGUE[k.owner].parameters[k.name].neutral if k.owner else model.model[k.name]
+    return model.effect(k.owner, k.name) if k.owner else model.model[k.name]
 
 
 def clipped(name: str, value: float) -> float:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aeropend_ident.diagnosis.chain.chain import DELAY, CutChains
+from aeropend_ident.diagnosis.chain.known import Known
 from aeropend_ident.diagnosis.chain.priors import (
     CHOSEN,
     FINDINGS,
@@ -20,7 +21,7 @@ from aeropend_ident.diagnosis.chain.priors import (
 )
 from aeropend_ident.diagnosis.chain.values import PLACE_OF_PARAMETER, STAGES
 from aeropend_ident.diagnosis.policy import angle_only
-from aeropend_ident.estimation.parameter import Parameter
+from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
 from aeropend_sim.model.parameters import PARAMETERS, Model
 
@@ -51,6 +52,9 @@ Choice: what sticks at once gives no gradient."""
 STICKING = ("coulomb_friction", "rotor_friction")
 """Effects that can stick."""
 
+OF_A_MASS = ("mgd_over_J", "L_over_J", "c_over_J")
+"""Parameters that a mass on the arm changes together: it changes weight and inertia."""
+
 SAME = 1e-6
 """Change of a residual, in units of a reading's noise, that is rounding (choice).
 
@@ -63,7 +67,7 @@ class Hypothesis:
 
     Attributes:
         effect: id of the effect.
-        parameter: of the model, for `parameter_mismatch`; else "".
+        parameter: of the model, the first of its own, for `parameter_mismatch`; else "".
         starts: start points of searches, each the effect's own parameters, its size first.
         begun: names and values from which a search starts, if it was identified with the nominal model.
     """
@@ -76,7 +80,7 @@ class Hypothesis:
     @property
     def name(self) -> str:
         """A unique name."""
-        return f"{self.effect}:{self.parameter}" if self.parameter else self.effect
+        return f"{self.effect}:{'+'.join(p.name for p in self.own)}" if self.parameter else self.effect
 
     @property
     def place(self) -> str:
@@ -94,14 +98,17 @@ class Hypothesis:
         return math.log(EFFECT_ODDS / (sum(map(len, STAGES.values())) if self.parameter else 1))
 
 
-def hypotheses(model: Model, *, mismatches: bool = True) -> list[Hypothesis]:
+def hypotheses(model: Model, *, mismatches: bool = True, known: Known | None = None) -> list[Hypothesis]:
     """Every effect of the catalogue that the model lacks.
 
     Args:
         model: the nominal model.
         mismatches: whether each parameter of the model may be far off, too.
+        known: what earlier verdicts know; parameters and effects that they have determined may have changed.
     """
     all_ = [Hypothesis(id_, starts=tuple(_starts(id_, model))) for id_ in CATALOGUE if id_ not in model.effects]
+    if known is not None:
+        return [*all_, *_changes(model, known)]
     if not mismatches:
         return all_
     for names in STAGES.values():
@@ -112,6 +119,28 @@ def hypotheses(model: Model, *, mismatches: bool = True) -> list[Hypothesis]:
                 own = Parameter(name, nominal, MISMATCH_SD * abs(nominal), p.low, p.high, start=1.1 * nominal)
                 all_.append(Hypothesis(PARAMETER_MISMATCH, name, ((own,),)))
     return all_
+
+
+def _changes(model: Model, known: Known) -> Iterable[Hypothesis]:
+    """A parameter or the size of an effect that differs from what earlier verdicts have determined."""
+    numbers = {}
+    for p in (p for stage in STAGES for p in known.parameters([stage], math.inf)):
+        wide = MISMATCH_SD * abs(p.mean)
+        if key(p.name).owner == "" and known.sd(p.name) < wide:
+            limit = PARAMETERS[f"model.{p.name}"]
+            own = Parameter(p.name, p.mean, wide, limit.low, limit.high, start=1.1 * p.mean)
+            numbers[p.name] = own
+            yield Hypothesis(PARAMETER_MISMATCH, p.name, ((own,),))
+    if all(name in numbers for name in OF_A_MASS):
+        yield Hypothesis(PARAMETER_MISMATCH, OF_A_MASS[0], (tuple(numbers[name] for name in OF_A_MASS),))
+    for id_, parameters in model.effects.items():
+        if id_ in CATALOGUE and f"{id_}.{CATALOGUE[id_].size}" in known.names:
+            size = CATALOGUE[id_].parameters[CATALOGUE[id_].size]
+            was = parameters[CATALOGUE[id_].size]
+            wide = max(abs(was - size.neutral), abs(usual_size(id_, model) - size.neutral))
+            own = Parameter(f"{id_}.{CATALOGUE[id_].size}", was, wide, size.low, size.high,
+                            start=was + FIRST_SIZE * wide)
+            yield Hypothesis(id_, starts=((own,),))
 
 
 def _starts(id_: str, model: Model) -> Iterable[tuple[Parameter, ...]]:

@@ -258,7 +258,7 @@ def _best_windows(chains: CutChains, stage: str, f: Findings, candidates: Sequen
     if not len(instants):
         return []
     cuts = np.searchsorted(at[order], instants)
-    information = jacobian @ jacobian.T + np.eye(len(known))
+    information = jacobian @ jacobian.T + search.prior
     inverse = np.linalg.inv(information)
     pull = inverse @ (jacobian @ r + search.z)
 

@@ -83,7 +83,8 @@ def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], No
         Stage -> what was found.
     """
     findings: dict[str, Findings] = {}
-    everything = [as_identified(chains, h) for h in hypotheses(chains.model, mismatches=chains.policy.calibrated)
+    calibrated, known = chains.policy.calibrated, chains.known
+    everything = [as_identified(chains, h) for h in hypotheses(chains.model, mismatches=calibrated, known=known)
                   if not is_decided(chains, h)]
     acts_on = {h.name: stages_of(chains, h) for h in everything}
     carried: dict[str, Parameter] = {}

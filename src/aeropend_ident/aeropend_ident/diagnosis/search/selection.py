@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
-from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD, absent, nominal_parameters
-from aeropend_ident.diagnosis.chain.values import CHANNELS_OF
+from aeropend_ident.diagnosis.chain.priors import absent, nominal_parameters, nominal_sd
+from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, neutral
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.diagnosis.search.findings import RankedHypothesis, Selection, adopted
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
@@ -126,14 +126,13 @@ class SelectionRound:
                 best[h.name] = (x, h, j)
         ranked = [(h, j) for _, h, j in sorted(best.values(), key=lambda item: item[0])]
         # a parameter that is far off already explains nothing more as a mismatch; its wider prior only fits better
-        misplaced = [(h, j) for h, j in ranked[SHORTLIST:]
-                     if h.begun or (h.parameter and self._misplaced(h.parameter))]
+        misplaced = [(h, j) for h, j in ranked[SHORTLIST:] if h.begun or self._misplaced(h)]
         return ranked[:SHORTLIST] + misplaced
 
-    def _misplaced(self, name: str) -> bool:
-        nominal = self.chains.model.model[name]
-        return self.chains.policy.calibrated and abs(
-            self.current.values[name] - nominal) > MISPLACED * NOMINAL_SD * abs(nominal)
+    def _misplaced(self, h: Hypothesis) -> bool:
+        name, chains = h.own[0].name, self.chains
+        return chains.policy.calibrated and name in self.current.values and abs(
+            self.current.values[name] - neutral(chains.model, name)) > MISPLACED * nominal_sd(chains, name)
 
     def warm_started(self, tried: FittedHypotheses) -> tuple[FittedHypotheses, Hypothesis | None]:
         """Fit the best to its end and start the others again from its parameters.
@@ -286,7 +285,8 @@ class SelectionRound:
             return {k: r for function in functions for k, r in function(values).items()}
 
         steps, least = self.chains.policy.steps, self.chains.policy.least_ess
-        if hypothesis.parameter and begun is None:  # it is fitted already: only its prior becomes wider
+        fitted = hypothesis.parameter or hypothesis.effect in self.chains.model.effects
+        if fitted and begun is None:  # it is fitted already: only its prior becomes wider
             begun = self.current.values
         if begun is None and hypothesis.begun:
             begun = {**self.current.values, **dict(hypothesis.begun)}

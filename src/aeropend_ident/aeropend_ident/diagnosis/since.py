@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What has changed since earlier verdicts of a rig, whose model and covariance are the nominal ones."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Container, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeropend_ident.diagnosis import document
+from aeropend_ident.diagnosis.chain.known import Known, limits, pooled
+from aeropend_ident.diagnosis.chain.values import neutral, with_values
+from aeropend_ident.diagnosis.document import Change, DiagnosisDocument, DocumentError, Estimates, Interval, Since
+from aeropend_ident.diagnosis.joint_fit import WIDER, JointFit
+from aeropend_ident.estimation.parameter import key
+from aeropend_ident.signals.statistics import Z95
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import Model, load
+
+Array = NDArray[np.float64]
+
+FREE_SD = 0.5
+"""Relative standard deviation of a parameter that an earlier verdict says nothing of (choice: nearly free)."""
+
+SHOWN = 0.25
+"""Standard deviation of a change, over the value, above which a recording does not show whether it changed (choice)."""
+
+
+def read(folders: Sequence[Path]) -> tuple[Model, Known, list[DiagnosisDocument]]:
+    """The model of earlier verdicts of one rig.
+
+    Args:
+        folders: with the results of `diagnose`, one of each verdict; the last gives what is not estimated.
+
+    Returns:
+        The model with the mean estimates, what is known of it, and the documents.
+
+    Raises:
+        DocumentError, ModelError: a verdict cannot be used; one line says why.
+    """
+    documents = [document.read(folder / "diagnosis.json") for folder in folders]
+    models = [load(folder / "augmented.yaml") for folder in folders]
+    for folder, d in zip(folders, documents, strict=True):
+        if d.estimates is None:
+            raise DocumentError(f"{folder / 'diagnosis.json'}: holds no estimates to compare with: the model could "
+                                "not be identified, or an older version wrote it; diagnose the recording again")
+    known = pooled([Known(e.names, np.array(e.values), np.array(e.covariance), (folder.name,))
+                    for folder, e in zip(folders, (d.estimates for d in documents), strict=True) if e is not None])
+    model = models[-1]
+    for other in models[:-1]:
+        missing = {e: p for e, p in other.effects.items() if e not in model.effects}
+        model = model.with_effects({**model.effects, **missing})
+    found = with_values(model, dict(zip(known.names, known.values.tolist(), strict=True)))
+    return Model(f"{known.verdicts[-1]}, augmented", found.model, found.sensing, found.effects), known, documents
+
+
+def estimates(joint: JointFit) -> Estimates:
+    """The estimates of a joint fit with their covariance; those that each recording has of its own as their mean."""
+    names = [n for n in joint.values if not key(n).is_initial]
+    of_fit = list(joint.fit.values)
+    at = [of_fit.index(n) for n in names]
+    covariance = np.linalg.inv(joint.fit.information(joint.fit.ess))[np.ix_(at, at)]
+    scale = np.array([joint.sd[n] for n in names]) / np.sqrt(np.diag(covariance))
+    covariance *= np.outer(scale, scale)
+    plain = list(dict.fromkeys(key(n).plain for n in names))
+    mean = np.array([[float(key(n).plain == p) for n in names] for p in plain])
+    mean /= mean.sum(axis=1, keepdims=True)
+    values = np.array([joint.values[n] for n in names])
+    own = mean @ covariance @ mean.T
+    for j, weights in enumerate(mean):
+        runs = values[weights > 0.0]
+        if len(runs) > 1:  # a further recording differs from the mean by the scatter between recordings
+            own[j, j] += max(float(np.var(runs, ddof=1)) - own[j, j], 0.0)
+    return Estimates(tuple(plain), tuple((mean @ values).tolist()), tuple(tuple(row) for row in own.tolist()))
+
+
+def changes(known: Known, joint: JointFit, claimed: Container[str]) -> Since:
+    """What has changed, and what has not.
+
+    Args:
+        known: what the earlier verdicts know.
+        joint: the joint fit.
+        claimed: names of the hypotheses that are part of the verdict.
+    """
+    model = joint.chains.model
+    compared = _Compared.of(joint, known)
+    found = {p.name: h.name in claimed for f in joint.findings.values() for h in f.effects for p in h.own}
+    changed = []
+    for name, material in found.items():
+        before, after = neutral(model, name), joint.values[name]
+        new = key(name).owner in CATALOGUE and key(name).owner not in model.effects
+        _, sd = compared.change(name, found)
+        changed.append(Change(name, limits(name).unit, None if new else _interval(before, known.sd(name)),
+                              _interval(after, joint.sd[name]), _interval(after - before, sd), material))
+    same, open_ = {}, []
+    for name in known.names:
+        if name in compared.names and name not in found:
+            before = abs(neutral(model, name))
+            off, sd = compared.change(name, [*found, name])
+            if sd > SHOWN * before or before == 0.0:
+                open_.append(name)
+            else:
+                same[name] = _interval(off / before, sd / before)
+    return Since(known.verdicts, tuple(changed), same, tuple(open_))
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """The joint fit beside the earlier verdicts, made linear at its end, in standard units.
+
+    Attributes:
+        known: what the earlier verdicts know.
+        names: (P,) parameters of the fit.
+        unit: (P,) the standard unit of each.
+        wide: (P,) standard deviation, in standard units, of a parameter that may have changed.
+        data: (P, P) what the data alone say of them: information matrix.
+        pull: (P,) gradient of the prior: what the data pull against.
+    """
+
+    known: Known
+    names: list[str]
+    unit: Array
+    wide: Array
+    data: Array
+    pull: Array
+
+    @classmethod
+    def of(cls, joint: JointFit, known: Known) -> _Compared:
+        """From a joint fit."""
+        names, parameters = list(joint.fit.values), joint.parameters
+        z = np.array([parameters[n].to_standard(joint.values[n]) for n in names])
+        unit = np.array([abs(parameters[n].slope(x)) for n, x in zip(names, z, strict=True)])
+        values = np.abs([joint.values[n] for n in names])
+        return cls(known, names, unit, np.maximum(FREE_SD * values / unit, 1.0),
+                   joint.fit.information(joint.fit.ess) - joint.fit.prior, joint.fit.prior @ z)
+
+    def change(self, name: str, free: Collection[str]) -> tuple[float, float]:
+        """Change of a parameter and its standard deviation if some parameters, and no others, have changed.
+
+        Value before and value after are two variables of a parameter that may have changed. All others are one each,
+        and correlate with the values before: so a change may be sharp of which only products with others are known.
+
+        Args:
+            name: of the parameter.
+            free: those that may have changed, this one among them.
+        """
+        before, count = list(self.known.names), len(self.known.names)
+        deviation = np.array([max(self.known.sd(n), 1e-300) for n in before])
+        after = [n for n in self.names if n not in before or n in free]
+        at = np.array([count + after.index(n) if n in after else before.index(n) for n in self.names])
+        own = [self.names.index(n) for n in after]
+        unit = np.r_[deviation, self.unit[own]]
+        scale = unit[at] / self.unit
+        information = np.zeros((len(unit), len(unit)))
+        correlation = self.known.covariance / np.outer(deviation, deviation)
+        information[:count, :count] = np.linalg.pinv(correlation, hermitian=True)
+        information[np.ix_(at, at)] += self.data * np.outer(scale, scale)
+        spread = np.where([n in before for n in after], self.wide[own], 1.0)
+        information[range(count, len(unit)), range(count, len(unit))] += spread**-2.0
+        difference = np.zeros(len(unit))
+        difference[count + after.index(name)] = unit[count + after.index(name)]
+        off = 0.0
+        if name in before:
+            j = before.index(name)
+            difference[j] = -unit[j]
+            pull = self.pull[self.names.index(name)] / self.unit[self.names.index(name)]
+            off = pull * float(difference @ np.linalg.solve(information, difference))
+        return off, WIDER * math.sqrt(max(float(difference @ np.linalg.solve(information, difference)), 0.0))
+
+
+def _interval(value: float, sd: float) -> Interval:
+    return Interval(value, value - Z95 * sd, value + Z95 * sd)
+
+
+def lines(since: Since) -> list[str]:
+    """What has changed, in lines for the terminal."""
+    named = " and ".join(since.verdicts)
+    changed = sorted(since.changes, key=lambda c: not c.claimed)
+    out = [f"  {'changed' if c.claimed else 'small change'} since {named}: {described(c)}" for c in changed]
+    if not changed:
+        out.append(f"  nothing has changed since {named} that the recording shows")
+    same = [f"{name} (at most {_farthest(x)})" for name, x in since.unchanged.items()]
+    if same:
+        out.append(f"  not changed: {', '.join(same)}")
+    if since.not_shown:
+        out.append(f"  the recording does not show whether these have changed: {', '.join(since.not_shown)}")
+    return out
+
+
+def described(c: Change) -> str:
+    """A change in words: `coulomb_friction.accel 0.41 -> 0.83 rad/s² (+0.42, 0.39 to 0.45)`."""
+    unit = "" if c.unit == "-" else f" {c.unit}"
+    between = f"{c.change.value:+.3g}, {c.change.low:+.3g} to {c.change.high:+.3g}"
+    if c.before is None:
+        return f"{c.name} appeared: {c.after.value:.4g} ({c.after.low:.4g} to {c.after.high:.4g}){unit}"
+    share = f"{100.0 * c.change.value / c.before.value:+.1f} %; " if c.before.value else ""
+    return f"{c.name} {c.before.value:.4g} -> {c.after.value:.4g}{unit} ({share}{between})"
+
+
+def _farthest(change: Interval) -> str:
+    """The largest change within the interval, as a share of the value before."""
+    return f"{100.0 * max(abs(change.low), abs(change.high)):.2g} %"
