@@ -7,11 +7,9 @@ from dataclasses import dataclass
 
 from aeropend_ident.diagnosis.document import Candidate, DiagnosisDocument, Interval, NextExperiment
 from aeropend_ident.diagnosis.report.number_format import interval, minus, percent, with_unit
+from aeropend_ident.diagnosis.report.sentence import SAME_END
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
 from aeropend_sim.model.parameters import PARAMETERS
-
-SAME_END = 1e-3
-"""Width of the interval of a share below which the interval is not shown (derived: its ends would be the same text)."""
 
 PROBABLE = 0.01
 """Probability from which a candidate is always visible (choice)."""
