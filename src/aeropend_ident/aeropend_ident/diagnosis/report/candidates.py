@@ -71,7 +71,7 @@ class Candidates:
 
     shown: list[CandidateRow]
     others: list[CandidateRow]
-    not_separable: tuple[tuple[str, str], ...]
+    not_separable: list[tuple[str, str]]
     advice: NextExperiment | None
 
 
@@ -94,6 +94,14 @@ def share_text(share: Interval) -> str:
     return f"{percent(share.value)} ({percent(share.low)} to {percent(share.high)})"
 
 
+def open_pairs(document: DiagnosisDocument) -> list[tuple[str, str]]:
+    """The pairs of hypotheses that stay open and concern the verdict: one of the two is part of it."""
+    which = document.which
+    claimed = {c.effect for c in which.candidates if c.found}
+    claimed |= {f"{c.effect}:{name}" for c in which.candidates if c.found for name in c.parameters}
+    return [pair for pair in which.not_separable if claimed & set(pair)]
+
+
 def rows(document: DiagnosisDocument) -> list[CandidateRow]:
     """All candidates."""
     return [_row(c) for c in document.which.candidates]
@@ -108,7 +116,8 @@ def section(document: DiagnosisDocument, candidates: list[CandidateRow]) -> Cand
     """
     shown = [c for c in candidates if c.found or c.share or c.probability >= PROBABLE]
     others = [c for c in candidates if c not in shown]
-    return Candidates(shown, others, document.which.not_separable, document.which.next_experiment)
+    return Candidates(shown, others, open_pairs(document),
+                      document.which.next_experiment)
 
 
 def _row(c: Candidate) -> CandidateRow:

@@ -143,6 +143,11 @@ def plain_percent(share: float | None, decimals: int = 0) -> str:
     return f"{round(100.0 * share, decimals) + 0.0:.{decimals}f}"
 
 
+def fit_text(fit: float) -> str:
+    """The fit of a free run, 1 - RMS / spread, in words where the model is worse than a constant: `98 %`."""
+    return f"{plain_percent(fit)} %" if not fit < 0.0 else "worse than a constant"
+
+
 def probability(p: float) -> str:
     """A probability (0 to 1) in percent; never 0 or 100."""
     return UNKNOWN if math.isnan(p) else percent(min(max(p, 1e-6), 1.0 - 1e-6))

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from aeropend_ident.diagnosis.document import DiagnosisDocument
+from aeropend_ident.diagnosis.document import DiagnosisDocument, Lift
 from aeropend_ident.diagnosis.report.number_format import exact, interval, quantity
 from aeropend_sim.model.parameters import parameter
 
@@ -13,6 +13,9 @@ OFF = 0.05
 """Relative shift above which a parameter is marked.
 
 Derived: the tolerance that the priors of calibrated rigs assume."""
+
+NO_DEAD_ZONE = 0.005
+"""Duty below which a dead zone is none (choice: half of the change that counts as no excitation)."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +108,18 @@ def section(document: DiagnosisDocument) -> Parameters:
     return Parameters(rows, reach, f"{100.0 * OFF:g}", _identified(document))
 
 
+def lift_text(lift: Lift, duration: float) -> str:
+    """The lift of the duty, in words.
+
+    Args:
+        lift: the curve.
+        duration: [s] of the recordings; they do not show a longer lag.
+    """
+    dead = f", none below {quantity(lift.dead_zone, digits=2)}" if lift.dead_zone >= NO_DEAD_ZONE else ""
+    lag = f"of {quantity(lift.lag_s, 's', 2)}" if lift.lag_s < duration else "longer than the recording"
+    return f"up to {quantity(lift.rad_per_s2[-1], 'rad/s²')} at a duty of {lift.duty[-1]:.2f}{dead}, with a lag {lag}"
+
+
 def _identified(document: DiagnosisDocument) -> IdentifiedText | None:
     identified = document.identified
     if identified is None:
@@ -114,7 +129,6 @@ def _identified(document: DiagnosisDocument) -> IdentifiedText | None:
     hangs, lift = identified.hangs_at, identified.lift
     if hangs and hangs.run_to_run:
         spread.append(f"the angle where the arm hangs by {quantity(hangs.run_to_run, 'rad', 2)}")
-    curve = (f"up to {quantity(lift.rad_per_s2[-1], 'rad/s²')} at a duty of {lift.duty[-1]:.2f}, none below "
-             f"{lift.dead_zone:.2f}, with a lag of {quantity(lift.lag_s, 's', 2)}" if lift else "")
+    curve = lift_text(lift, document.duration_s) if lift else ""
     return IdentifiedText(identified.basis, identified.not_determined, ", ".join(spread),
                           quantity(hangs.value, "rad", 2) if hangs else "", curve)
