@@ -131,7 +131,7 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
                      f"{f': {why}' if why else ''}.")
     else:
         left = {"part": f"; {plain_percent(1.0 - (closure.closed or 0.0))} % of the gap stays open",
-                "none": "; none of the gap closes on unseen data"}.get(sentence.closing(closure), "")
+                "none": "; none of the gap closes on held-out data"}.get(sentence.closing(closure), "")
         lines.append(f"verdict: {' and '.join(which.effects)} ({document.where.place}){left}")
     if which.verdict != CANNOT_TELL and (failed := sentence.failed(document)):
         lines.append(f"warning: {failed}")

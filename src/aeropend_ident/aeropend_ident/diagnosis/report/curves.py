@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.diagnosis import Diagnosis
-from aeropend_ident.diagnosis.document import Curve, DiagnosisDocument, UnknownEffect
+from aeropend_ident.diagnosis.document import CANNOT_TELL, Curve, DiagnosisDocument, UnknownEffect
 from aeropend_ident.diagnosis.report.binned import variable
 from aeropend_ident.diagnosis.report.drawing import HEIGHT, WIDTH, from_top, grid
 from aeropend_ident.diagnosis.report.number_format import Tick, quantity, ticks, with_unit
@@ -124,14 +124,14 @@ class _Curve:
 
 
 def section(diagnosis: Diagnosis, document: DiagnosisDocument) -> Unknown | None:
-    """The content of the section; None if there is no unknown effect.
+    """The content of the section; None if no unknown effect is part of the verdict.
 
     Args:
         diagnosis: the diagnosis.
         document: its document.
     """
     unknown = document.which.unknown
-    if unknown is None:
+    if unknown is None or document.which.verdict == CANNOT_TELL:
         return None
     n = diagnosis.augmented.model
     speed, current = (np.concatenate([np.asarray(r[c]) for r in diagnosis.after]) for c in ("omega", "i_a"))

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The section on the gap: how far it closes, channel by channel."""
+"""The sections on the gap: how far it closes, channel by channel, and on test recordings."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from aeropend_ident.diagnosis.document import Closure, DiagnosisDocument, GapBudget
+from aeropend_ident.diagnosis.document import Across, Closure, DiagnosisDocument, GapBudget
 from aeropend_ident.diagnosis.report.number_format import percent, quantity
+from aeropend_ident.diagnosis.report.sentence import between, closing
 from aeropend_ident.diagnosis.report.variables import VARIABLES, Variable
 from aeropend_ident.signals.signals import CHANNELS
 
@@ -43,6 +44,18 @@ class BudgetPart:
 
 
 @dataclass(frozen=True)
+class TestRow:
+    """The gap on a test recording; `closed` and its interval as texts."""
+
+    bag: str
+    gap: float
+    gap_after: float
+    floor: float
+    closed: str
+    between: str
+
+
+@dataclass(frozen=True)
 class GapTable:
     """The content of the section.
 
@@ -51,12 +64,14 @@ class GapTable:
         total: over all channels.
         budget: what could be closed, part by part; empty if nothing is open.
         missing: names of channels that were not measured.
+        tests: recordings that no fit has used.
     """
 
     rows: list[ChannelRow]
     total: Closure
     budget: list[BudgetPart]
     missing: list[str]
+    tests: list[TestRow]
 
 
 def missing(document: DiagnosisDocument) -> list[str]:
@@ -74,7 +89,14 @@ def section(document: DiagnosisDocument) -> GapTable:
                  f"floor {quantity(c.floor, v.unit)}")
         bars = (100.0 * c.gap / top, 100.0 * c.gap_after / top, 100.0 * c.floor / top)
         rows.append(ChannelRow(v, c.gap, c.gap_after, c.floor, bars, label))
-    return GapTable(rows, document.closure, _budget(document.closure.budget), missing(document))
+    return GapTable(rows, document.closure, _budget(document.closure.budget), missing(document),
+                    [_test(t) for t in document.closure.across])
+
+
+def _test(t: Across) -> TestRow:
+    reached = closing(t)
+    closed = {"nothing open": "nothing to close", "none": "none"}.get(reached, percent(t.closed))
+    return TestRow(t.bag, t.gap, t.gap_after, t.floor, closed, "" if reached == "none" else between(t))
 
 
 def _budget(budget: GapBudget | None) -> list[BudgetPart]:
@@ -83,7 +105,7 @@ def _budget(budget: GapBudget | None) -> list[BudgetPart]:
     at = f" in the {budget.place}" if budget.place else ""
     parts, start = [], 0.0
     for share, colour, words in ((budget.found, "augmented", "closed"),
-                                 (budget.repeatable, "nominal", f"a function of duty and state{at} would close it"),
+                                 (budget.repeatable, "nominal", f"would be closed by a function of duty and state{at}"),
                                  (budget.not_repeatable, "measured", "does not repeat")):
         parts.append(BudgetPart(start, 100.0 * share, colour, f"{percent(share)} {words}"))
         start += 100.0 * share

@@ -81,7 +81,7 @@ def verdict(document: DiagnosisDocument) -> list[Part]:
     if reached == "none" and not set(effects) <= RANDOM:
         several = len(effects) + len(parameters) > 1
         return [*listed([*effects, *parameters]), Part(f" {'fit' if several else 'fits'} the fitted part of the "
-                f"recording, but {'close' if several else 'closes'} none of the gap on unseen data.")]
+                f"recording, but {'close' if several else 'closes'} none of the gap on held-out data.")]
     left = f"; {open_} of the gap stays open." if reached in ("part", "none") else quiet
     return [*_claim(effects, parameters, complete=left == "."), Part(left)]
 
@@ -124,7 +124,7 @@ def consequence(document: DiagnosisDocument) -> str:
     amount = "none" if reached == "none" else percent(closure.closed)
     interval = between(closure) if reached != "none" else ""
     text = (f"{action} closes {amount} of the gap{f' ({percent(0.95)} interval {interval})' if interval else ''} on "
-            f"unseen data, {held}.")
+            f"held-out data, {held}.")
     if closure.closed < -NONE:
         text += " The gap even grows."
     if reached in ("part", "none") and RANDOM & set(which.effects):

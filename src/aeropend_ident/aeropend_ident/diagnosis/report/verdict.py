@@ -63,7 +63,7 @@ def section(document: DiagnosisDocument, candidates: Sequence[CandidateRow]) -> 
     return Verdict(_title(document), sentence.failed(document), sentence.verdict(document),
                    sentence.consequence(document), [Line(c, _nominal(document, c)) for c in found],
                    sentence.between(document.closure),
-                   unknown.place if unknown and which.verdict != "unknown" else "",
+                   unknown.place if unknown and which.verdict not in ("unknown", CANNOT_TELL) else "",
                    [c for c in candidates if c.share and not c.found],
                    which.unexplained if which.verdict == "unknown" else ())
 
