@@ -298,6 +298,13 @@ def test_curves_that_are_multiplied_keep_their_slope():
     assert steps.unit == "V per unit of duty"
 
 
+def test_a_share_of_the_thrust_ends_where_no_thrust_is_left():
+    wild = of("omega (share of the thrust)", [1.0, 20.0, 40.0, 60.0], [-63.0, -0.2, -0.1, 0.0], "-")
+    (share,) = curves.draw(UnknownEffect("thrust", (wild,)), FACTORS, 49.0).pictures
+    assert plain(share.text).startswith("Rises from −100 % at 0 rad/s to 15 % at 60 rad/s")
+    assert plain(share.text).endswith("it is cut off at 100 %, where there is too little thrust to show it.")
+
+
 def test_a_curve_over_time_ends_with_the_data():
     over_time = of("t", [0.0, 20.0, 40.0, 60.0, 70.0], [1.0, 2.0, 4.0, 0.0, 0.0])
     (made,) = curves.draw(UnknownEffect("arm", (over_time, of("theta", [], []))), FACTORS, 49.0).pictures
@@ -589,7 +596,8 @@ def test_quantities(value, unit, text):
     ((0.79937, 0.79810, 0.80065), ("0.7994", "0.7981 to 0.8006")),
     ((1.7823e-5, 1.6815e-5, 1.8831e-5), ("1.78 × 10⁻⁵", "1.68 to 1.88 × 10⁻⁵")),
     ((45142.4, 42099.0, 48186.0), ("45100", "42100 to 48200")),
-    ((0.0, -0.0286, 0.0286), ("0.000", "−0.029 to 0.029")),
+    ((0.0, -0.0286, 0.0286), ("0", "−0.029 to 0.029")),
+    ((0.004, -1.5, 1.5), ("0.004", "−1.5 to 1.5")),
     ((2.0, 2.0, 2.0), ("2.000", "2.000 to 2.000")),
     ((0.0004, 0.0, 0.31), ("< 0.31", "0 to 0.31")),
     ((1e-9, 0.0, 2e6), ("< 2.0 × 10⁶", "0 to 2.0 × 10⁶")),

@@ -27,7 +27,7 @@ from aeropend_ident.diagnosis.document import (
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.diagnosis.report import page, sentence
 from aeropend_ident.diagnosis.report.candidates import open_pairs, unit_of
-from aeropend_ident.diagnosis.report.number_format import fit_text, plain, plain_percent
+from aeropend_ident.diagnosis.report.number_format import fit_text, plain, plain_percent, plain_time
 from aeropend_ident.diagnosis.report.parameters import lift_text
 from aeropend_ident.result_folder import atomic_folder, ensure_free
 from aeropend_ident.signals.signals import Signals
@@ -227,6 +227,6 @@ def describe(candidate: Candidate) -> str:
     """A candidate's parameters with units and 95 % intervals, and its share of the gap."""
     texts = [f"{name} = {plain(p.value)} ({plain(p.low)} to {plain(p.high)}) {unit_of(candidate.effect, name)}"
              for name, p in candidate.parameters.items()]
-    when = [f"; {word} at {t.value:.2f} s ({t.low:.2f} to {t.high:.2f} s)"
+    when = [f"; {word} at {plain_time(t.value)} s ({plain_time(t.low)} to {plain_time(t.high)} s)"
             for word, t in (("begins", candidate.since), ("ends", candidate.until)) if t]
     return ", ".join(texts) + "".join(when) + (f"; {of_the_gap(candidate.share)}" if candidate.share else "")

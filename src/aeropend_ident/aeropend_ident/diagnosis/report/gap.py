@@ -6,7 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from aeropend_ident.diagnosis.document import Across, Closure, DiagnosisDocument, GapBudget
-from aeropend_ident.diagnosis.report.number_format import percent, quantity
+from aeropend_ident.diagnosis.report.drawing import position
+from aeropend_ident.diagnosis.report.number_format import percent, quantity, sane
 from aeropend_ident.diagnosis.report.sentence import between, closing
 from aeropend_ident.diagnosis.report.variables import VARIABLES, Variable
 from aeropend_ident.signals.signals import CHANNELS
@@ -84,10 +85,10 @@ def section(document: DiagnosisDocument) -> GapTable:
     rows = []
     for name, c in document.channels.items():
         v = VARIABLES[name]
-        top = max(c.gap, c.gap_after, c.floor, 1e-300)
+        top = max(sane(x) for x in (1e-12, c.gap, c.gap_after, c.floor))
         label = (f"{v.name}: gap {quantity(c.gap, v.unit)}, after {quantity(c.gap_after, v.unit)}, "
                  f"floor {quantity(c.floor, v.unit)}")
-        bars = (100.0 * c.gap / top, 100.0 * c.gap_after / top, 100.0 * c.floor / top)
+        bars = (position(c.gap / top), position(c.gap_after / top), position(c.floor / top))
         rows.append(ChannelRow(v, c.gap, c.gap_after, c.floor, bars, label))
     return GapTable(rows, document.closure, _budget(document.closure.budget), missing(document),
                     [_test(t) for t in document.closure.across])
@@ -107,6 +108,7 @@ def _budget(budget: GapBudget | None) -> list[BudgetPart]:
     for share, colour, words in ((budget.found, "augmented", "closed"),
                                  (budget.repeatable, "nominal", f"would be closed by a function of duty and state{at}"),
                                  (budget.not_repeatable, "measured", "does not repeat")):
-        parts.append(BudgetPart(start, 100.0 * share, colour, f"{percent(share)} {words}"))
-        start += 100.0 * share
+        width = min(position(share), 100.0 - start)
+        parts.append(BudgetPart(start, width, colour, f"{percent(share)} {words}"))
+        start += width
     return parts

@@ -99,7 +99,8 @@ def interval(value: float, low: float, high: float) -> tuple[str, str]:
     if low >= 0.0 < high and texts[0] == texts[1] == zero != texts[2]:
         top = texts[2] + _power(exponent)
         return f"<\N{NO-BREAK SPACE}{top}", f"0 to {top}"
-    return texts[0] + _power(exponent), f"{texts[1]} to {texts[2]}{_power(exponent)}"
+    shown = quantity(value, digits=1) if texts[0] == zero else texts[0] + _power(exponent)
+    return shown, f"{texts[1]} to {texts[2]}{_power(exponent)}"
 
 
 def percent(share: float | None, sign: bool = False) -> str:
@@ -127,6 +128,11 @@ def percent(share: float | None, sign: bool = False) -> str:
     elif sign and x > 0.0:
         text = f"+{text}"
     return with_unit(text, "%").replace("-", "−")
+
+
+def plain_time(seconds: float) -> str:
+    """An instant for a terminal, to 10 ms: `12.30`."""
+    return f"{seconds:.2f}" if 0.005 <= abs(seconds) < LONG else plain(seconds, 2)
 
 
 def plain_percent(share: float | None, decimals: int = 0) -> str:
@@ -158,7 +164,7 @@ def _magnitude(x: float) -> int:
 
 
 def _exponent(x: float) -> int:
-    magnitude = _magnitude(x)
+    magnitude = _magnitude(float(f"{x:.2e}"))  # 9.999 is 10.0 in three digits
     return magnitude if magnitude < -3 or magnitude > 4 else 0
 
 
@@ -201,7 +207,8 @@ def ends(low: float, high: float) -> list[str]:
         high: upper end.
     """
     decimals = 1 - _magnitude(high - low) if math.isfinite(high - low) else 0
-    return [_on_axis(x, decimals) for x in (low, high)]
+    texts = [_on_axis(x, decimals) for x in (low, high)]
+    return ["0" if text == fixed(0.0, 0, decimals) else text for text in texts]
 
 
 class Tick(NamedTuple):

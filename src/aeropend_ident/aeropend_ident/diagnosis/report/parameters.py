@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from aeropend_ident.diagnosis.document import DiagnosisDocument, Lift
@@ -83,8 +84,8 @@ class Parameters:
     identified: IdentifiedText | None
 
     def at(self, shift: float) -> float:
-        """[%] Position of a shift in the picture."""
-        return 50.0 + 50.0 * min(max(shift / self.reach, -1.0), 1.0)
+        """[%] Position of a shift in the picture; in the middle if it is not known."""
+        return 50.0 if math.isnan(shift) else 50.0 + 50.0 * min(max(shift / self.reach, -1.0), 1.0)
 
     @property
     def band(self) -> float:
@@ -104,7 +105,8 @@ def section(document: DiagnosisDocument) -> Parameters:
         shift, low, high = ((x - n.nominal) / scale for x in (n.value, n.low, n.high))
         rows.append(ParameterRowText(name, "" if p.unit == "-" else p.unit, p.description, exact(n.nominal), value,
                                      between, shift, low, high, abs(shift) > OFF))
-    reach = max([2.0 * OFF, *(1.05 * min(abs(x), 1.0) for r in rows for x in (r.shift, r.low, r.high))])
+    shifts = [x for r in rows for x in (r.shift, r.low, r.high) if math.isfinite(x)]
+    reach = max([2.0 * OFF, *(1.05 * min(abs(x), 1.0) for x in shifts)])
     return Parameters(rows, reach, f"{100.0 * OFF:g}", _identified(document))
 
 

@@ -216,9 +216,10 @@ def _strip(drawing: _Drawing, columns: int, series: list[Array]) -> Strip:
 def _width(diagnosis: Diagnosis, k: int, document: DiagnosisDocument) -> float:
     """How wide the gap of recording k is: mean square over the channels, each over its gap in all recordings."""
     s, before = diagnosis.signals[k], diagnosis.before[k]
-    errors = [np.nanmean(((before[c] - s.channel(c)) / max(document.channels[c].gap, 1e-12)) ** 2)
+    errors = [((before[c] - s.channel(c)) / max(document.channels[c].gap, 1e-12)) ** 2
               for c in document.channels if s.has(c)]
-    return float(np.mean(errors)) if errors else 0.0
+    known = [float(e[np.isfinite(e)].mean()) if np.isfinite(e).any() else math.inf for e in errors]
+    return float(np.mean(known)) if known else 0.0
 
 
 def _packed(x: Array) -> Packed:
