@@ -52,6 +52,17 @@ def test_a_bag_gives_a_verdict(bag, tmp_path):
     assert sorted(p.name for p in out.iterdir()) == ["augmented.yaml", "diagnosis.json", "report.html"]
 
 
+@pytest.mark.promise("Verdict", "`--open` shows the report in the browser")
+def test_the_report_is_given_to_the_browser(bag, tmp_path, monkeypatch):
+    chosen = tmp_path / "browser"
+    chosen.write_text(f'#!/bin/sh\necho "$1" > {tmp_path}/opened\n')
+    chosen.chmod(0o755)
+    monkeypatch.setenv("BROWSER", f"{chosen} %s")
+    result = run(bag, "--out", tmp_path / "verdict", "--open")
+    assert (result.returncode, result.stderr) == (0, "")
+    assert (tmp_path / "opened").read_text().strip() == (tmp_path / "verdict" / "report.html").as_uri()
+
+
 def test_results_are_not_overwritten_unasked(bag, tmp_path):
     out = tmp_path / "verdict"
     out.mkdir()
@@ -72,6 +83,7 @@ def test_results_are_not_overwritten_unasked(bag, tmp_path):
     (["BAG", "--test", "no_such_bag"], "no_such_bag"),
     (["BAG", "--test", "BAG"], "fitted to"),
     (["--each", "BAG", "--test", "no_such_bag"], "--each"),
+    (["--each", "BAG", "--open"], "--open"),
 ])
 def test_a_wrong_command_line_is_one_line(bag, tmp_path, arguments, words):
     message = refused(*[bag if a == "BAG" else a for a in arguments], "--out", tmp_path / "out")
