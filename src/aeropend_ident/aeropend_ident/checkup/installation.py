@@ -31,7 +31,7 @@ MOST_DOMAIN, USUAL_DOMAIN = 232, 101
 FULL, LOW = 100e6, 2e9
 """[bytes] Free disk below which nothing can be recorded, and below which a long recording may not fit.
 
-Choice: a rig fills some 0.6 GB in an hour."""
+Choice: a rig fills about 0.5 GB in an hour."""
 
 
 def checks(folder: Path, environment: Mapping[str, str] = os.environ) -> Iterator[Check]:
@@ -170,4 +170,4 @@ def disk(folder: Path, free: float) -> Check:
     room = f"{free / 1e9:.1f} GB free in {folder.resolve()}"
     if free < FULL:
         return error("disk", f"{room}: make room before you record")
-    return warning("disk", f"{room}: an hour of a rig needs 0.6 GB") if free < LOW else ok("disk", room)
+    return warning("disk", f"{room}: an hour of a rig needs 0.5 GB") if free < LOW else ok("disk", room)

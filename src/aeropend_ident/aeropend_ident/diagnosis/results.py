@@ -198,7 +198,7 @@ def gap_line(name: str, closed: ClosedGap) -> str:
 
 def budget_line(budget: GapBudget) -> str:
     """What could be closed of the gap at all."""
-    at = f" in the {budget.place}" if budget.place and budget.repeatable >= MATERIAL_SHARE else ""
+    at = f" ({budget.place})" if budget.place and budget.repeatable >= MATERIAL_SHARE else ""
     return (f"  of the squared gap: {plain_percent(budget.found)} % closed, {plain_percent(budget.repeatable)} % would "
             f"be closed by some function of duty and state{at}, {plain_percent(budget.not_repeatable)} % does not "
             "repeat")

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from aeropend_ident.diagnosis.document import Across, Closure, DiagnosisDocument, GapBudget
+from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.diagnosis.report.drawing import position
 from aeropend_ident.diagnosis.report.number_format import percent, quantity, sane
 from aeropend_ident.diagnosis.report.sentence import between, closing
@@ -103,7 +104,7 @@ def _test(t: Across) -> TestRow:
 def _budget(budget: GapBudget | None) -> list[BudgetPart]:
     if budget is None:
         return []
-    at = f" in the {budget.place}" if budget.place else ""
+    at = f" ({budget.place})" if budget.place and budget.repeatable >= MATERIAL_SHARE else ""
     parts, start = [], 0.0
     for share, colour, words in ((budget.found, "augmented", "closed"),
                                  (budget.repeatable, "nominal", f"would be closed by a function of duty and state{at}"),

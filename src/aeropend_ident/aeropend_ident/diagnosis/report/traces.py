@@ -190,6 +190,9 @@ def _channel(diagnosis: Diagnosis, k: int, channel: str) -> list[_Drawing]:
     before, after = diagnosis.before[k][channel], diagnosis.after[k][channel]
     measured, v = diagnosis.signals[k].channel(channel), VARIABLES[channel]
     errors = {"nominal": before - measured, "augmented": after - measured}
+    pulses = diagnosis.signals[k].pulses
+    if channel == "omega" and pulses is not None and len(pulses.index):  # before, the rig reads no speed
+        errors = {name: np.where(np.arange(len(e)) < pulses.index[0], np.nan, e) for name, e in errors.items()}
     part = held_out(diagnosis.signals[k])
     known = [e[part][np.isfinite(e[part])] for e in errors.values()]
     sizes = [quantity(rms(e) if len(e) else math.nan, v.unit) for e in known]
