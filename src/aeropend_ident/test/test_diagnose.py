@@ -33,10 +33,22 @@ def bag(bags, tmp_path_factory):
     return bags.write(tmp_path_factory.mktemp("made") / "my_bag", made)
 
 
+@pytest.fixture(scope="module")
+def verdict(bag, tmp_path_factory):
+    """The folder with the results, what the command said, and the page that the browser was given."""
+    folder = tmp_path_factory.mktemp("results")
+    browser = folder / "browser"
+    browser.write_text(f'#!/bin/sh\necho "$1" > {folder}/opened\n')
+    browser.chmod(0o755)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("BROWSER", f"{browser} %s")
+        result = run(bag, "--out", folder / "verdict", "--open")
+    return folder / "verdict", result, (folder / "opened").read_text().strip()
+
+
 @pytest.mark.promise("Verdict", "Gaps are measured in free runs on held-out data that no fit has used")
-def test_a_bag_gives_a_verdict(bag, tmp_path):
-    out = tmp_path / "verdict"
-    result = run(bag, "--out", out)
+def test_a_bag_gives_a_verdict(bag, verdict):
+    out, result, _ = verdict
     assert result.returncode == 0, result.stderr
     assert result.stdout.startswith("verdict: coulomb_friction (arm)\n")
     body = json.loads((out / "diagnosis.json").read_text())
@@ -53,14 +65,10 @@ def test_a_bag_gives_a_verdict(bag, tmp_path):
 
 
 @pytest.mark.promise("Verdict", "`--open` shows the report in the browser")
-def test_the_report_is_given_to_the_browser(bag, tmp_path, monkeypatch):
-    chosen = tmp_path / "browser"
-    chosen.write_text(f'#!/bin/sh\necho "$1" > {tmp_path}/opened\n')
-    chosen.chmod(0o755)
-    monkeypatch.setenv("BROWSER", f"{chosen} %s")
-    result = run(bag, "--out", tmp_path / "verdict", "--open")
-    assert (result.returncode, result.stderr) == (0, "")
-    assert (tmp_path / "opened").read_text().strip() == (tmp_path / "verdict" / "report.html").as_uri()
+def test_the_report_is_given_to_the_browser(verdict):
+    out, result, opened = verdict
+    assert result.stderr == ""
+    assert opened == (out / "report.html").as_uri()
 
 
 def test_results_are_not_overwritten_unasked(bag, tmp_path):

@@ -32,6 +32,7 @@ from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.signals import Signals
 from aeropend_ident.signals.statistics import Z95
+from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import MODEL_NAMES, PARAMETERS, Model
 
@@ -134,7 +135,7 @@ def identified_model(chains: CutChains, joint: JointFit, rows: Mapping[str, Para
                              own.run_to_run if own else None)
     terms = [n for n in CHOSEN if n in values and n != ZERO and key(n).owner in chains.model.effects and lift]
     return Identified(basis(recordings), tuple(n for n, row in rows.items() if not row.determined), lift, hangs,
-                      {n: _interval(values[n], joint.sd[n]) for n in terms})
+                      {n: _within_range(n, values[n], joint.sd[n]) for n in terms})
 
 
 def candidates(joint: JointFit, statistical: Statistical, held_out: HeldOut, gap_after: float,
@@ -245,6 +246,12 @@ def next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[Ranked
     if any(key(n).recording for n in values):
         one, other = of_rig(one), of_rig(other)
     return experiment_design.next_experiment(model, signals, one, other, names(first, second), tried)
+
+
+def _within_range(name: str, value: float, sd: float) -> Interval:
+    """The estimate of a parameter of an effect; its interval ends where the range of the parameter does."""
+    p = CATALOGUE[key(name).owner].parameters[key(name).name]
+    return _interval(value, sd, p.low, p.high)
 
 
 def _finite(x: float) -> float | None:
