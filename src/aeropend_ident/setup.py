@@ -35,6 +35,7 @@ setup(
             "bench_test = aeropend_ident.commands.bench:main",
             "excitation_quality = aeropend_ident.commands.excitation_quality:main",
             "step_response = aeropend_ident.commands.step_response:main",
+            "doctor = aeropend_ident.commands.doctor:main",
             "demo = aeropend_ident.commands.demo:main",
         ]
     },

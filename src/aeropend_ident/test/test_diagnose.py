@@ -17,7 +17,7 @@ from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import load
 
 KEYS = ["format", "bags", "model", "duration_s", "samples", "train_s", "held_out_s", "channels", "where", "which",
-        "shrink", "notes", "seconds"]
+        "shrink", "estimates", "notes", "seconds"]
 
 
 COMMAND = Command("aeropend_ident.commands.diagnose")
@@ -33,10 +33,22 @@ def bag(bags, tmp_path_factory):
     return bags.write(tmp_path_factory.mktemp("made") / "my_bag", made)
 
 
+@pytest.fixture(scope="module")
+def verdict(bag, tmp_path_factory):
+    """The folder with the results, what the command said, and the page that the browser was given."""
+    folder = tmp_path_factory.mktemp("results")
+    browser = folder / "browser"
+    browser.write_text(f'#!/bin/sh\necho "$1" > {folder}/opened\n')
+    browser.chmod(0o755)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("BROWSER", f"{browser} %s")
+        result = run(bag, "--out", folder / "verdict", "--open")
+    return folder / "verdict", result, (folder / "opened").read_text().strip()
+
+
 @pytest.mark.promise("Verdict", "Gaps are measured in free runs on held-out data that no fit has used")
-def test_a_bag_gives_a_verdict(bag, tmp_path):
-    out = tmp_path / "verdict"
-    result = run(bag, "--out", out)
+def test_a_bag_gives_a_verdict(bag, verdict):
+    out, result, _ = verdict
     assert result.returncode == 0, result.stderr
     assert result.stdout.startswith("verdict: coulomb_friction (arm)\n")
     body = json.loads((out / "diagnosis.json").read_text())
@@ -50,6 +62,13 @@ def test_a_bag_gives_a_verdict(bag, tmp_path):
     augmented = load(out / "augmented.yaml")
     assert augmented.effects["coulomb_friction"]["accel"] == pytest.approx(0.8, rel=0.05)
     assert sorted(p.name for p in out.iterdir()) == ["augmented.yaml", "diagnosis.json", "report.html"]
+
+
+@pytest.mark.promise("Verdict", "`--open` shows the report in the browser")
+def test_the_report_is_given_to_the_browser(verdict):
+    out, result, opened = verdict
+    assert result.stderr == ""
+    assert opened == (out / "report.html").as_uri()
 
 
 def test_results_are_not_overwritten_unasked(bag, tmp_path):
@@ -72,6 +91,7 @@ def test_results_are_not_overwritten_unasked(bag, tmp_path):
     (["BAG", "--test", "no_such_bag"], "no_such_bag"),
     (["BAG", "--test", "BAG"], "fitted to"),
     (["--each", "BAG", "--test", "no_such_bag"], "--each"),
+    (["--each", "BAG", "--open"], "--open"),
 ])
 def test_a_wrong_command_line_is_one_line(bag, tmp_path, arguments, words):
     message = refused(*[bag if a == "BAG" else a for a in arguments], "--out", tmp_path / "out")

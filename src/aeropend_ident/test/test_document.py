@@ -84,7 +84,7 @@ def test_a_document_comes_back_as_it_was(made):
 def test_optional_keys_are_there_only_where_they_have_a_value():
     body = to_json(calibrated())
     assert list(body) == ["format", "bags", "model", "duration_s", "samples", "train_s", "held_out_s", "channels",
-                          "where", "which", "shrink", "notes", "seconds"]
+                          "where", "which", "shrink", "estimates", "notes", "seconds"]
     assert list(body["shrink"])[-2:] == ["across", "budget"]
     assert next(iter(body["shrink"]["across"][0])) == "bag"
     assert all(list(row) == ["nominal", "value", "low", "high"] for row in body["which"]["numbers"].values())

@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 
 from aeropend_ident.bags.recording import RecordingError
-from aeropend_ident.commands.excitation_quality import main, planned, quality
+from aeropend_ident.commands.excitation_quality import main
+from aeropend_ident.identification.excitation_quality import planned, quality
 from aeropend_sim.model import rig
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import load

@@ -24,7 +24,7 @@ LAYERS = [
     ["diagnosis.report"],
     ["diagnosis.results"],
     ["diagnosis.batch", "diagnosis.dask_cluster"],
-    ["tables", "bench_tests"],
+    ["tables", "bench_tests", "checkup"],
     ["public", "testing"],
     ["nodes", "commands"],
     ["studies"],

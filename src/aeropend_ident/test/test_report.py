@@ -14,8 +14,8 @@ import one_way_arm
 import pytest
 
 from aeropend_ident.diagnosis.diagnosis import diagnose
-from aeropend_ident.diagnosis.document import Curve, UnknownEffect, from_json, to_json
-from aeropend_ident.diagnosis.report import curves, drawing, number_format, parameters, traces
+from aeropend_ident.diagnosis.document import Across, Curve, Identified, UnknownEffect, from_json, to_json
+from aeropend_ident.diagnosis.report import candidates, curves, drawing, number_format, parameters, traces
 from aeropend_ident.diagnosis.report import page as report_page
 from aeropend_ident.diagnosis.results import document, verdict_lines
 from aeropend_ident.signals.signals import from_arrays
@@ -240,10 +240,11 @@ def test_what_an_unknown_looks_like(strange):
     beyond = sum(t > strange.signals[0].train * SAMPLE_PERIOD for c in unknown["curves"] if c["variable"] == "t"
                  for t in c["at"])
     assert sum(a["d"].count("M") for a in drawn) == sum(len(c["at"]) for c in unknown["curves"]) - beyond + bool(beyond)
-    names = [t for t in page.text("figure", "p").split("torque on the arm") if t]
-    assert names[0].strip().startswith(", as acceleration, rad/s² against the arm rate")
+    names = page.text("figure", "p").split("torque on the arm")
+    assert names[1].strip().startswith(", as acceleration, rad/s² against the arm rate")
     captions = page.text("figcaption")
-    assert captions.startswith("What could be closed of the squared gap: ")
+    assert captions.startswith("Fit of the angle in a free run of the augmented model: ")
+    assert "What could be closed of the squared gap" in captions
     assert "Peaks at" in captions
     assert captions.count(".") >= len(drawn)
 
@@ -297,6 +298,13 @@ def test_curves_that_are_multiplied_keep_their_slope():
     assert steps.unit == "V per unit of duty"
 
 
+def test_a_share_of_the_thrust_ends_where_no_thrust_is_left():
+    wild = of("omega (share of the thrust)", [1.0, 20.0, 40.0, 60.0], [-63.0, -0.2, -0.1, 0.0], "-")
+    (share,) = curves.draw(UnknownEffect("thrust", (wild,)), FACTORS, 49.0).pictures
+    assert plain(share.text).startswith("Rises from −100 % at 0 rad/s to 15 % at 60 rad/s")
+    assert plain(share.text).endswith("it is cut off at 100 %, where there is too little thrust to show it.")
+
+
 def test_a_curve_over_time_ends_with_the_data():
     over_time = of("t", [0.0, 20.0, 40.0, 60.0, 70.0], [1.0, 2.0, 4.0, 0.0, 0.0])
     (made,) = curves.draw(UnknownEffect("arm", (over_time, of("theta", [], []))), FACTORS, 49.0).pictures
@@ -346,7 +354,9 @@ def test_reasons_for_care(friction, angle_only):
     moved = {**numbers, "R_a": {"nominal": 1.0, "value": 1.2, "low": 1.1, "high": 1.3}}
     assert "not part of the verdict: R_a. Check them in the model file." in care(friction, numbers=moved)
     still = replace(friction.signals[0], duty=np.full(len(friction.signals[0]), 0.3))
-    assert "The duty varied by only 0.0" in care(replace(friction, signals=[still]))
+    assert "The duty stayed the same" in care(replace(friction, signals=[still]))
+    calm = replace(still, duty=np.linspace(0.3, 0.4, len(still)))
+    assert "The duty varied by only 0.10" in care(replace(friction, signals=[calm]))
     noted = replace(friction.signals[0], notes=("not measured: v_a", "2 samples are missing in 1 gap"))
     assert "1 note describes" in care(replace(friction, signals=[noted]))
     assert "note" not in care(friction)
@@ -384,10 +394,122 @@ def test_effects_and_a_number_together(friction):
 def test_what_is_open(friction):
     advice = {"why": "slow ramps tell them apart", "excite": {"kind": "steps", "duration": 60, "sequence": [0.1, 0.2]}}
     page = Page(rendered(friction, not_separable=[["coulomb_friction", "quadratic_drag"]], next_experiment=advice))
-    assert "This recording cannot separate coulomb_friction from quadratic_drag." in page.text("main")
+    assert "cannot separate coulomb_friction from quadratic_drag: either explains it" in page.text("main")
+    assert "(coulomb_friction: probability > 99.9 %, gap after 1.2 %; quadratic_drag: " in page.text("main")
     assert "slow ramps tell them apart" in page.text("main")
     assert page.text("main", "pre") == "excite --ros-args -p kind:=steps -p duration:=60 -p 'sequence:=[0.1, 0.2]'"
     assert "cannot separate" not in Page(rendered(friction, not_separable=[], next_experiment=None)).text("main")
+
+
+@pytest.mark.promise("Verdict", "Pairs that cannot be separated are named where one of them is part of the verdict")
+def test_a_pair_that_does_not_concern_the_verdict_is_not_named(friction):
+    advice = {"why": "slow ramps tell them apart", "excite": {}}
+    which = {"not_separable": [["thrust_lag", "encoder_lag"]], "next_experiment": advice}
+    page = Page(rendered(friction, **which))
+    assert "cannot separate" not in page.text("main")
+    assert "slow ramps" not in page.text("main")
+    assert not [line for line in verdict_lines(documented(friction, **which)) if "separable" in line or "next" in line]
+
+
+@pytest.mark.promise("Verdict", "The report lists every hypothesis that was tried, how far it came and why it lost")
+def test_what_was_tried_is_listed_with_the_reason_why_it_lost(friction, strange):
+    page = Page(rendered(friction))
+    assert "part of the verdict" in page.text("table")
+    assert page.text("table").count("less evidence than coulomb_friction; leaves a larger gap") >= 5
+    page = Page(rendered(strange))
+    assert "no more evidence than without it" in page.text("table")
+    for c in strange.conclusions.which.candidates:
+        assert c.effect in page.text("table")
+        assert number_format.percent(c.gap_after).replace("\N{NO-BREAK SPACE}", " ") in page.text("table")
+
+
+def test_nothing_tried_is_said(nominal):
+    assert "No effect was tried: refitted parameters leave too little" in Page(rendered(nominal)).text("main")
+    failed = Page(rendered(nominal, verdict="cannot_tell"))
+    assert "No effect was tried, since the nominal model could not be identified." in failed.text("main")
+
+
+@pytest.mark.parametrize(("changes", "reason"), [
+    ({"found": True}, ""),
+    ({"share": {"value": 0.2, "low": -0.1, "high": 0.4}}, "its share of the gap is not surely above 0"),
+    ({"share": {"value": 0.01, "low": 0.005, "high": 0.02}},
+     "its share of the gap is too small, or too unsure, to be claimed"),
+    ({"gap_after": 0.2}, "less evidence than thrust_lag; does not make the gap smaller"),
+    ({"gap_after": 0.0122, "behind": "parameter_mismatch:R_a"}, "less evidence than R_a"),
+    ({"gap_after": None, "behind": None, "evidence": -3.0}, "no more evidence than without it"),
+    ({"gap_after": None, "behind": None, "evidence": 3.0}, "too improbable"),
+    ({"parameters": {"tau": {"value": 10.0, "low": 9.0, "high": 10.0}}, "gap_after": None},
+     "tau is at the end of its range; less evidence than thrust_lag"),
+])
+def test_reasons_why_a_hypothesis_lost(friction, changes, reason):
+    row = {"effect": "gust", "place": "arm", "probability": 0.1, "parameters": {}, "found": False, "gap_after": 0.05,
+           "evidence": 1.0, "behind": "thrust_lag", **changes}
+    if "parameters" in changes:
+        end = CATALOGUE["gust"].parameters["tau"].high
+        row["parameters"] = {"tau": {"value": end, "low": 0.9 * end, "high": end}}
+    made = documented(friction, candidates=[row])
+    assert candidates.why_lost(made, made.which.candidates[0]) == reason
+
+
+def test_a_rival_has_the_gap_of_a_model_without_what_was_found(friction):
+    found, *rivals = friction.conclusions.which.candidates
+    assert len(rivals) >= 5
+    assert all(r.behind == "coulomb_friction" and r.gap_after > 3.0 * found.gap_after for r in rivals)
+
+
+@pytest.mark.promise("Verdict", "A report without a verdict says so at the top, in red")
+def test_a_failed_diagnosis_says_so_at_the_top(friction, strange):
+    why = "the model does not predict the rig: it is off; record more"
+    page = Page(rendered(strange, verdict="cannot_tell", effects=[], unexplained=[why]))
+    assert page.text("h1") == "Cannot tell: the model does not predict the rig."
+    assert "It is off. Record more." in page.text("header")
+    assert page.all("body") == [{"class": "subdued"}]
+    (banner,) = [a for a in page.all("p") if a.get("role") == "alert"]
+    assert banner["class"] == "failed"
+    assert "unknown" not in page.ids
+    assert Page(rendered(friction)).all("body") == [{}]
+
+
+@pytest.mark.promise("Verdict", "The report shows what test recordings say")
+def test_test_recordings_are_in_the_report(friction):
+    tests = (Across("tuesday", 0.12, 0.013, 0.011, 0.981, 0.97, 0.99),
+             Across("wednesday", 0.1, 0.3, 0.01, -2.0, -3.0, 0.1))
+    made = document(friction, ["monday"], "bench", 2.5, tests)
+    page = Page(report_page.render(friction, made, "diagnose monday --test tuesday --test wednesday"))
+    assert "On 2 test recordings, which no fit has used, none to 98 % of the gap closes." in page.text("header")
+    assert "tuesday12 %1.3 %1.1 %98 %(97 % to 99 %)" in page.text("table")
+    assert "wednesday10 %30 %1.0 %none" in page.text("table")
+
+
+def test_the_subtitle_of_an_identified_rig_names_no_preset(friction):
+    assert "model bench" in Page(rendered(friction)).text("header")
+    made = replace(documented(friction), identified=Identified("the angle", ()))
+    page = Page(report_page.render(friction, made, "diagnose my_bag --uncalibrated"))
+    assert "model identified from this recording" in page.text("header")
+    assert "bench" not in page.text("header")
+
+
+def test_the_whole_recording_is_drawn_and_the_held_out_part_is_marked(friction):
+    page = Page(rendered(friction))
+    (data,) = page.data()
+    s = friction.signals[0]
+    assert (data["start"], data["unseen"], data["stop"]) == (0.0, s.train * s.period, len(s) * s.period)
+    marked = [a for a in page.all("rect") if a.get("class") == "unseen"]
+    assert len(marked) == 1 + 2 * 4
+    for a in marked:
+        assert float(a["x"]) == pytest.approx(0.7 * drawing.WIDTH, abs=1.0)
+        assert float(a["x"]) + float(a["width"]) == pytest.approx(drawing.WIDTH, abs=0.2)
+    assert "99 % on the fitted part, 99 % on the held-out one." in page.text("figcaption")
+
+
+def test_a_model_that_runs_away_does_not_hide_the_readings(friction):
+    s = friction.signals[0]
+    away = [{**readings, "theta": readings["theta"] + np.geomspace(1e-3, 1e9, len(s))} for readings in friction.after]
+    strips = traces.section(replace(friction, after=away), documented(friction)).full[0].strips
+    low, high = next(strip.within for strip in strips if strip.variable.name == "arm angle")
+    assert high - low == pytest.approx(3.0 * np.nanmax(s.theta) - 3.0 * np.nanmin(s.theta))
+    heights = [float(y) for strip in strips for line in strip.lines for y in line.path[1:].split("l")[0].split()[1:]]
+    assert all(0.0 <= y <= drawing.HEIGHT for y in heights)
 
 
 def test_a_number_that_moved_is_marked(friction):
@@ -420,9 +542,18 @@ def test_a_short_free_decay_is_drawn_without_what_it_lacks(angle_only):
 
 def test_several_recordings_are_told_apart(two):
     page = Page(rendered(two, ["monday", "tuesday"]))
-    assert page.text("figcaption").endswith("mondaytuesday")
+    captions = page.text("figcaption")
+    assert captions.index("monday. Fit") < captions.index("tuesday. Fit")
     assert len(page.data()) == 2
     assert "the last part of each recording" in page.text("header")
+
+
+def test_notes_of_several_recordings_name_their_recording(two):
+    noted = replace(two, signals=[replace(s, notes=(f"{k} samples are missing",)) for k, s in enumerate(two.signals)])
+    made = document(noted, ["monday", "tuesday"], "bench", 1.0)
+    assert made.notes == ("monday: 0 samples are missing", "tuesday: 1 samples are missing")
+    assert document(replace(noted, signals=noted.signals[:1]), ["monday"], "bench", 1.0).notes == (
+        "0 samples are missing",)
 
 
 def test_names_cannot_inject(friction):
@@ -445,12 +576,17 @@ def test_a_long_recording_stays_small(friction):
     far = [{c: x + rng.standard_normal(n) for c, x in noise.items()}] * 5
     text = rendered(replace(friction, signals=[long] * 5, before=far, after=far), list("abcde"))
     assert len(text.encode()) < 1_500_000
-    assert "The 4 recordings with the largest gap are shown." in Page(text).text("main")
+    page = Page(text)
+    assert len(page.data()) == 4
+    assert "The arm angle of the other recordings" in page.text("main")
+    captions = page.text("figcaption")
+    assert all(f"{bag}. Fit of the angle" in captions for bag in "abcde")
 
 
 @pytest.mark.parametrize(("value", "unit", "text"), [
     (0.032041, "rad", "0.0320 rad"), (3.0501, "rad/s", "3.05 rad/s"), (1.7823e-5, "kg·m²", "1.78 × 10⁻⁵ kg·m²"),
-    (-12345.6, "", "−12300"), (0.0, "A", "0.00 A"), (2.0, "-", "2.00"), (None, "A", "–"), (math.nan, "A", "–"),
+    (-12345.6, "", "−12300"), (0.0, "A", "0 A"), (1e-20, "s", "0 s"), (1e40, "s", "–"),
+    (2.0, "-", "2.00"), (None, "A", "–"), (math.nan, "A", "–"),
 ])
 def test_quantities(value, unit, text):
     assert number_format.quantity(value, unit).replace("\N{NO-BREAK SPACE}", " ") == text
@@ -460,8 +596,12 @@ def test_quantities(value, unit, text):
     ((0.79937, 0.79810, 0.80065), ("0.7994", "0.7981 to 0.8006")),
     ((1.7823e-5, 1.6815e-5, 1.8831e-5), ("1.78 × 10⁻⁵", "1.68 to 1.88 × 10⁻⁵")),
     ((45142.4, 42099.0, 48186.0), ("45100", "42100 to 48200")),
-    ((0.0, -0.0286, 0.0286), ("0.000", "−0.029 to 0.029")),
+    ((0.0, -0.0286, 0.0286), ("0", "−0.029 to 0.029")),
+    ((0.004, -1.5, 1.5), ("0.004", "−1.5 to 1.5")),
     ((2.0, 2.0, 2.0), ("2.000", "2.000 to 2.000")),
+    ((0.0004, 0.0, 0.31), ("< 0.31", "0 to 0.31")),
+    ((1e-9, 0.0, 2e6), ("< 2.0 × 10⁶", "0 to 2.0 × 10⁶")),
+    ((1.0, -1e300, 1e300), ("1.00", "– to –")),
     ((1.0, math.nan, math.inf), ("1.00", "– to –")),
 ])
 def test_intervals(numbers, texts):
@@ -471,9 +611,25 @@ def test_intervals(numbers, texts):
 @pytest.mark.parametrize(("share", "text"), [
     (1.0, "100 %"), (0.9996, "> 99.9 %"), (0.994, "99.4 %"), (0.636, "64 %"), (0.0712, "7.1 %"), (0.0004, "< 0.1 %"),
     (0.0, "0 %"), (-0.0003, "0 %"), (-0.2, "−20 %"), (None, "–"),
+    (-63.0, "< −999 %"), (1e9, "> 999 %"), (math.inf, "> 999 %"), (math.nan, "–"),
 ])
 def test_percents(share, text):
     assert number_format.percent(share).replace("\N{NO-BREAK SPACE}", " ") == text
+
+
+@pytest.mark.parametrize(("value", "digits", "text"), [
+    (0.79937, 4, "0.7994"), (1.23e-7, 4, "1.23e-07"), (110.4, 2, "110"), (3.2e9, 2, "3.2e+09"), (2.5e-16, 2, "0"),
+    (-0.0, 4, "0"), (None, 4, "?"), (math.nan, 4, "?"), (1e300, 4, "?"),
+])
+def test_numbers_of_a_terminal(value, digits, text):
+    assert number_format.plain(value, digits) == text
+
+
+@pytest.mark.parametrize(("share", "decimals", "text"), [
+    (0.876, 0, "88"), (0.1251, 1, "12.5"), (-0.001, 0, "0"), (-63.0, 0, "<-999"), (1e9, 1, ">999"), (None, 0, "?"),
+])
+def test_percents_of_a_terminal(share, decimals, text):
+    assert number_format.plain_percent(share, decimals) == text
 
 
 def test_no_probability_is_certain():

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The lines that a diagnosis prints."""
 
+import math
+
 import pytest
 
 from aeropend_ident.diagnosis.document import (
@@ -27,6 +29,12 @@ def test_the_line_of_a_gap(closed, low, high, text):
     assert gap_line("gap", ClosedGap(0.125, 0.02, 0.01, closed, low, high)) == start + text
 
 
+def test_a_gap_beyond_reason_is_a_bound():
+    line = gap_line("gap", ClosedGap(63.0, math.nan, 1e-9, -63.0, -1e9, 0.1))
+    assert line.startswith("gap: >999 % of the signals' spread, ? % with the augmented model, floor 0.0 %: <-999 % ")
+    assert line.endswith("(<-999 to 10 %) of the gap above the floor is closed")
+
+
 def test_the_parameters_of_a_candidate_have_units():
     friction = Candidate("coulomb_friction", "arm", 0.99, {"accel": Interval(0.8, 0.75, 0.85)}, True, 0.1)
     assert describe(friction) == "accel = 0.8 (0.75 to 0.85) rad/s²"
@@ -46,6 +54,9 @@ def test_the_line_of_an_uncalibrated_rig():
             "c_over_J": ParameterRow(1.0, 1.5, 1.4, 1.6, determined=True, runs=(), run_to_run=0.25)}
     lift = Lift((0.0, 0.9), (0.0, 20.0), 0.1, 0.3)
     assert identified_line(Identified("the angle", ("R_a",), lift, HangingAngle(0.1, 0.0, 0.2)), rows) == (
-        "identified from the angle: c_over_J = 1.5 (1.4 to 1.6, run to run 0.25), hangs at 0.1 rad, lift up to 20 "
-        "rad/s² at a duty of 0.90, none below 0.1, with a lag of 0.3 s; not determined: R_a")
+        "identified from the angle: c_over_J = 1.5 (1.4 to 1.6, run to run 0.25), hangs at 0.1 rad, lift up to 20.0 "
+        "rad/s² at a duty of 0.90, none below 0.10, with a lag of 0.30 s; not determined: R_a")
+    slow = Lift((0.0, 0.9), (0.0, 20.0), 2.5e-16, 110.0)
+    assert identified_line(Identified("the angle", (), slow), {}, 60.0) == (
+        "identified from the angle: lift up to 20.0 rad/s² at a duty of 0.90, with a lag longer than the recording")
     assert identified_line(Identified("the angle", ()), {}) == "identified from the angle: nothing"

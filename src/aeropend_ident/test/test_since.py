@@ -25,7 +25,7 @@ FRICTION = 0.5
 WITH_A_MASS = {"mgd_over_J": 1.06, "c_over_J": 0.9, "L_over_J": 0.9}
 
 
-def columns_of(model: Model, seed: int, seconds: float = 25.0) -> dict[str, np.ndarray]:
+def columns_of(model: Model, seed: int, seconds: float = 40.0) -> dict[str, np.ndarray]:
     duty = steps(seconds, seed)
     columns, _ = rig.record(model, duty, seed)
     return {**columns, "duty": duty}

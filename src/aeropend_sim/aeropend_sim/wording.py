@@ -11,3 +11,16 @@ def counted(number: int, noun: str, plural: str = "") -> str:
         plural: its plural; "": the singular with an s.
     """
     return f"{number} {noun}" if number == 1 else f"{number} {plural or noun + 's'}"
+
+
+MANY = 1e4
+"""Ratio from which a text gives only a bound (choice: what is that far off needs no digits)."""
+
+
+def times(ratio: float) -> str:
+    """A ratio in words: `times(9.13)` is "9.1 times", `times(2e7)` is "more than 10000 times".
+
+    Args:
+        ratio: the number, 0 or more.
+    """
+    return f"{float(f'{ratio:.3g}'):g} times" if ratio < MANY else f"more than {MANY:g} times"

@@ -29,6 +29,7 @@ from aeropend_ident.diagnosis.results import FILES, Results, document
 from aeropend_ident.diagnosis.validation import validate
 from aeropend_ident.result_folder import ensure_free, folder_names
 from aeropend_ident.signals.from_bag import signals_of
+from aeropend_sim.cli import browser
 from aeropend_sim.cli.command import Parser, between, entry_point, own
 from aeropend_sim.cli.progress import progress
 from aeropend_sim.model.parameters import PRESETS, load
@@ -42,6 +43,7 @@ EXAMPLES = """examples:
   diagnose --each rigs/* --out verdicts          recordings of different rigs: a verdict each, and a table
   diagnose --each rigs/* --dask tcp://host:8786  the same on a Dask cluster (pip install 'aeropend_ident[dask]')
   diagnose let_go --uncalibrated                 a rig without a model file; a free decay needs no command
+  diagnose my_bag --open                         show the report in the browser
   diagnose my_bag --out verdict --jobs 2         choose the folder and the number of threads
   plant --ros-args --params-file verdict/augmented.yaml      simulate the augmented model
 
@@ -86,6 +88,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
                         help="how long the search for effects may take (default: a number of simulations bounds it for "
                              "uncalibrated rigs); a note tells if more time could change the verdict")
     parser.add_argument("--overwrite", action="store_true", help="replace results in the folder")
+    parser.add_argument("--open", action="store_true", help="show the report in the browser")
     options = parser.parse_args(arguments)
     if options.dask is not None and not options.each:
         parser.error("--dask needs --each: it distributes recordings of different rigs")
@@ -96,6 +99,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
             parser.error(f"--since and --{other.replace('_', '-')} contradict each other: leave the second out"
                          + (", the earlier verdict has the model of the rig" if other != "each" else ""))
     options.model = options.model or "bench"
+    if options.open and options.each:
+        parser.error("--open shows one report: leave --each out")
     if options.test and options.each:
         parser.error("--test needs recordings of one rig: leave --each out")
     for bag in options.test:
@@ -139,6 +144,8 @@ def run(options: argparse.Namespace, command: str) -> None:
     results.write(out, overwrite=options.overwrite)
     print("\n".join(results.lines))
     print(printable(f"{out / 'report.html'}   {out / 'augmented.yaml'}   {results.document.seconds} s"))
+    if options.open and (why_not := browser.show(out / "report.html")):
+        print(printable(f"diagnose: {why_not}"), file=sys.stderr)
 
 
 def run_each(options: argparse.Namespace) -> None:

@@ -32,14 +32,12 @@ from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.signals import Signals
 from aeropend_ident.signals.statistics import Z95
+from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import MODEL_NAMES, PARAMETERS, Model
 
 DETERMINED = 0.5
 """Share of a prior's width above which the recordings have not determined a parameter (choice)."""
-
-TRACE = 1e-3
-"""Probability below which the gap of a candidate is not computed (choice: such a candidate is no rival)."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +135,7 @@ def identified_model(chains: CutChains, joint: JointFit, rows: Mapping[str, Para
                              own.run_to_run if own else None)
     terms = [n for n in CHOSEN if n in values and n != ZERO and key(n).owner in chains.model.effects and lift]
     return Identified(basis(recordings), tuple(n for n, row in rows.items() if not row.determined), lift, hangs,
-                      {n: _interval(values[n], joint.sd[n]) for n in terms})
+                      {n: _within_range(n, values[n], joint.sd[n]) for n in terms})
 
 
 def candidates(joint: JointFit, statistical: Statistical, held_out: HeldOut, gap_after: float,
@@ -157,7 +155,10 @@ def candidates(joint: JointFit, statistical: Statistical, held_out: HeldOut, gap
     rows: dict[str, Candidate] = {}
     for f in joint.findings.values():
         accepted = {h.name for h in f.effects}
-        for selection in f.selections:
+        for k, selection in enumerate(f.selections):
+            winner = selection[0].hypothesis.name if k < len(f.found) else None
+            # what was found in its place, and after it, is no part of a rival's model
+            off = {p.name: neutral(held_out.model, p.name) for s in f.found[k:] for p in s[0].hypothesis.own}
             for r in selection:
                 h = r.hypothesis
                 mine = h.name in accepted
@@ -166,12 +167,13 @@ def candidates(joint: JointFit, statistical: Statistical, held_out: HeldOut, gap
                 if mine and r is not selection[0]:
                     continue
                 source, spread = (joint.values, joint.sd) if mine else (r.fit.values, r.fit.sd)
-                whole = {**joint.values, **r.fit.values}
+                whole = {**joint.values, **off, **r.fit.values}
                 estimates = {key(p.name).name: _interval(source[p.name], spread[p.name], p.low, p.high) for p in h.own}
-                after = gap_after if mine else held_out.gap_of(whole).total if r.probability > TRACE else None
+                after = gap_after if mine else _finite(held_out.gap_of(whole).total)
                 since, until = (onset.since, onset.until) if onset and mine else (None, None)
                 rows[h.name] = Candidate(h.effect, h.place, r.probability, estimates, h.name in claimed, after,
-                                         share.get(h.name) if mine else None, since, until)
+                                         share.get(h.name) if mine else None, since, until, _finite(r.gain),
+                                         None if mine else winner)
     for extra in statistical.found:
         h = extra.hypothesis
         estimates = {key(n).name: _interval(v, extra.fit.sd[n], 0.0) for n, v in extra.fit.values.items()}
@@ -244,6 +246,16 @@ def next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[Ranked
     if any(key(n).recording for n in values):
         one, other = of_rig(one), of_rig(other)
     return experiment_design.next_experiment(model, signals, one, other, names(first, second), tried)
+
+
+def _within_range(name: str, value: float, sd: float) -> Interval:
+    """The estimate of a parameter of an effect; its interval ends where the range of the parameter does."""
+    p = CATALOGUE[key(name).owner].parameters[key(name).name]
+    return _interval(value, sd, p.low, p.high)
+
+
+def _finite(x: float) -> float | None:
+    return x if math.isfinite(x) else None
 
 
 def _interval(value: float, sd: float, low: float = -math.inf, high: float = math.inf) -> Interval:

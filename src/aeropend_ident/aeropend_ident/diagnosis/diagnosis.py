@@ -55,6 +55,7 @@ from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import CHANNELS, Signals
 from aeropend_ident.signals.statistics import rms
 from aeropend_sim.model.parameters import Model
+from aeropend_sim.wording import times
 
 Array = NDArray[np.float64]
 
@@ -383,7 +384,7 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
         head = gap_share.Headline(CANNOT_TELL, "none", [], [], set())
     candidates = conclude.candidates(joint, found.statistical, gaps.held_out, gaps.after.total, head.claimed, share,
                                      found.onset)
-    reasons = [f"{c} is off by {x:.1f} times a reading's noise"
+    reasons = [f"{c} is off by {times(x)} a reading's noise"
                for c, x in _left(stages, gust=found.statistical.gust is not None).items() if x > GOOD_ENOUGH]
     reasons = [failed] if failed else reasons
     undecided = conclude.not_separable(chains, stages)
@@ -416,9 +417,9 @@ def _why_not_predicted(chains: CutChains, gaps: _Gaps) -> str:
     fitted, unseen = gaps.fits("theta")
     if unseen >= 0.0:
         return ""
-    return ("the model that was identified does not predict the rig: the fit of its free run is "
-            f"{fitted:.0%} on the part that was fitted and {unseen:.0%} on the unseen one, where a constant angle has "
-            "0 %; a longer recording whose last third repeats angles and duties of the part before helps most")
+    return ("the model that was identified does not predict the rig: on the unseen part its free run is off by "
+            f"{times(1.0 - unseen)} as much as a constant angle, on the part that was fitted by {times(1.0 - fitted)}; "
+            "a longer recording whose last third repeats angles and duties of the part before helps most")
 
 
 def _curves(term: MissingTerm) -> DrawnEffect:

@@ -109,10 +109,12 @@ class Candidate:
         probability: [0..1] its posterior probability among its rivals.
         parameters: name -> estimate of each of its parameters.
         found: whether it is part of the verdict.
-        gap_after: [share of the spread] total gap with it; null if it was not computed.
+        gap_after: [share of the spread] total gap with it; null if it diverges.
         share: [0..1] its share of the gap, which comes back without it; null if it is not in the augmented model.
         since: [s] when it begins, if that is not at the start of the recording.
         until: [s] when it ends, if that is not at the end of the recording.
+        evidence: log evidence over no further effect, from the fitted part; null if it was not compared.
+        behind: the hypothesis that was found in its place, "parameter_mismatch:NAME" for a parameter; null if none was.
     """
 
     effect: str
@@ -124,6 +126,8 @@ class Candidate:
     share: Interval | None = None
     since: Interval | None = None
     until: Interval | None = None
+    evidence: float | None = None
+    behind: str | None = None
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,9 +26,12 @@ from aeropend_ident.diagnosis.document import (
     to_json,
 )
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
-from aeropend_ident.diagnosis.report import page
-from aeropend_ident.diagnosis.report.candidates import unit_of
+from aeropend_ident.diagnosis.report import page, sentence
+from aeropend_ident.diagnosis.report.candidates import open_pairs, unit_of
+from aeropend_ident.diagnosis.report.number_format import fit_text, plain, plain_percent, plain_time
+from aeropend_ident.diagnosis.report.parameters import lift_text
 from aeropend_ident.result_folder import atomic_folder, ensure_free
+from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model.parameters import Model, save
 from aeropend_sim.untrusted import printable
 
@@ -62,7 +66,7 @@ class Results:
             document: its document.
             command: the command line that led here.
         """
-        lines = [f"note: {note}" for s in diagnosis.signals for note in s.notes] + verdict_lines(document)
+        lines = [f"note: {note}" for note in document.notes] + verdict_lines(document)
         lines = [printable(line) for line in lines]
         return cls(document, lines, page.render(diagnosis, document, command), diagnosis.augmented, command)
 
@@ -105,61 +109,75 @@ def document(diagnosis: Diagnosis, bags: Sequence[str], model: str, seconds: flo
         held_out_s=(round(train, 3), round(duration, 3)), channels=c.channels, where=c.where, which=c.which,
         closure=replace(c.closure, across=tuple(across)), identified=c.identified,
         since=c.since, estimates=c.estimates,
-        notes=tuple(note for s in signals for note in s.notes), seconds=round(seconds, 2))
+        notes=tuple(_notes(signals, bags)), seconds=round(seconds, 2))
+
+
+def _notes(recordings: Sequence[Signals], bags: Sequence[str]) -> Iterator[str]:
+    """The notes of all recordings; of several, each with the name of its recording."""
+    for s, bag in zip(recordings, bags, strict=False):
+        yield from (f"{bag}: {note}" if len(bags) > 1 else note for note in s.notes)
 
 
 def verdict_lines(document: DiagnosisDocument) -> list[str]:
     """The verdict in a few lines for the terminal."""
     which, closure = document.which, document.closure
+    headline = "".join(part.text for part in sentence.verdict(document))
+    why = "; ".join(which.unexplained)
     lines = []
     if which.verdict == "none":
-        lines.append("verdict: none. With refitted parameters the model explains the recording.")
+        lines.append(f"verdict: none. {_spaced(headline)}")
     elif which.verdict == CANNOT_TELL:
-        lines.append(f"verdict: cannot tell. {'; '.join(which.unexplained).capitalize()}.")
+        lines.append(f"verdict: cannot tell. {why[:1].upper()}{why[1:]}.")
     elif which.verdict == "unknown":
-        why = f": {'; '.join(which.unexplained)}" if which.unexplained else ""
-        lines.append(f"verdict: unknown ({document.where.place}). No effect of the catalogue explains the misfit{why}.")
+        lines.append(f"verdict: unknown ({document.where.place}). No effect of the catalogue explains the misfit"
+                     f"{f': {why}' if why else ''}.")
     else:
-        lines.append(f"verdict: {' and '.join(which.effects)} ({document.where.place})")
+        left = {"part": f"; {plain_percent(1.0 - (closure.closed or 0.0))} % of the gap stays open",
+                "none": "; none of the gap closes on held-out data"}.get(sentence.closing(closure), "")
+        lines.append(f"verdict: {' and '.join(which.effects)} ({document.where.place}){left}")
+    if which.verdict != CANNOT_TELL and (failed := sentence.failed(document)):
+        lines.append(f"warning: {failed}")
     found = {c.effect: c for c in reversed(which.candidates)}
-    lines += [f"  {effect}: {describe(found[effect])}" for effect in which.effects]
+    lines += [f"  {effect}: {describe(found[effect])}" for effect in which.effects if effect in found]
     small = [f"{c.effect}, {of_the_gap(c.share)}" for c in which.candidates if c.share and not c.found]
     if small:
         lines.append(f"  not claimed: {'; '.join(small)}")
-    lines += [f"  not separable by this recording: {' and '.join(pair)}" for pair in which.not_separable]
-    if which.next_experiment:
+    pairs = open_pairs(document)
+    lines += [f"  not separable by this recording, either explains it: {' and '.join(pair)}" for pair in pairs]
+    if pairs and which.next_experiment:
         lines.append(f"  next: {experiment(which.next_experiment)}")
     if document.identified is not None:
-        lines.append(f"  {identified_line(document.identified, which.numbers)}")
+        lines.append(f"  {identified_line(document.identified, which.numbers, document.duration_s)}")
     if document.since is not None:
         lines += since.lines(document.since)
     lines.append(gap_line("gap on held-out data", closure))
     if (angle := document.channels.get("theta")) is not None:
-        lines.append(f"  fit of the angle in a free run: {_percent(angle.fit_fitted)} % on the fitted part, "
-                     f"{_percent(angle.fit_unseen)} % on the unseen one")
+        lines.append(f"  fit of the angle in a free run: {fit_text(angle.fit_fitted)} on the fitted part, "
+                     f"{fit_text(angle.fit_unseen)} on the unseen one")
     if closure.budget is not None:
         lines.append(budget_line(closure.budget))
     lines += [gap_line(f"gap on {across.bag}, not fitted to", across) for across in closure.across]
     return lines
 
 
-def identified_line(identified: Identified, rows: Mapping[str, ParameterRow]) -> str:
+def identified_line(identified: Identified, rows: Mapping[str, ParameterRow], duration: float = math.inf) -> str:
     """The parameters of an uncalibrated rig in one line, and those that are not determined.
 
     Args:
         identified: what they were identified from.
         rows: name -> parameter.
+        duration: [s] of the recordings.
     """
-    texts = [f"{n} = {row.value:.4g} ({row.low:.4g} to {row.high:.4g}"
-             + (f", run to run {row.run_to_run:.2g})" if row.run_to_run else ")")
+    texts = [f"{n} = {plain(row.value)} ({plain(row.low)} to {plain(row.high)}"
+             + (f", run to run {plain(row.run_to_run, 2)})" if row.run_to_run else ")")
              for n, row in rows.items() if row.determined]
     if hangs := identified.hangs_at:
-        texts.append(f"hangs at {hangs.value:.3g} rad"
-                     + (f" (run to run {hangs.run_to_run:.2g})" if hangs.run_to_run else ""))
-    texts += [f"{n} = {size.value:.3g} ({size.low:.3g} to {size.high:.3g})" for n, size in identified.own.items()]
-    if lift := identified.lift:
-        texts.append(f"lift up to {lift.rad_per_s2[-1]:.3g} rad/s² at a duty of {lift.duty[-1]:.2f}, none below "
-                     f"{lift.dead_zone:.2g}, with a lag of {lift.lag_s:.2g} s")
+        texts.append(f"hangs at {plain(hangs.value, 3)} rad"
+                     + (f" (run to run {plain(hangs.run_to_run, 2)})" if hangs.run_to_run else ""))
+    texts += [f"{n} = {plain(size.value, 3)} ({plain(size.low, 3)} to {plain(size.high, 3)})"
+              for n, size in identified.own.items()]
+    if identified.lift:
+        texts.append(f"lift {_spaced(lift_text(identified.lift, duration))}")
     left = ", ".join(identified.not_determined)
     return (f"identified from {identified.basis}: {', '.join(texts) or 'nothing'}"
             + (f"; not determined: {left}" if left else ""))
@@ -172,35 +190,36 @@ def gap_line(name: str, closed: ClosedGap) -> str:
         name: of the data, the beginning of the line.
         closed: the gap before and after.
     """
-    gap, after, bottom = (100.0 * x for x in (closed.gap, closed.gap_after, closed.floor))
-    line = f"{name}: {gap:.1f} % of the signals' spread, {after:.1f} % with the augmented model, floor {bottom:.1f} %"
+    gap, after, bottom = (plain_percent(x, 1) for x in (closed.gap, closed.gap_after, closed.floor))
+    line = f"{name}: {gap} % of the signals' spread, {after} % with the augmented model, floor {bottom} %"
     if closed.closed is None:
         return f"{line}: nothing to close"
     interval = ""
     if closed.low is not None and closed.high is not None:
         interval = _between(closed.low, closed.high)
-    return f"{line}: {_percent(closed.closed)} %{interval} of the gap above the floor is closed"
+    return f"{line}: {plain_percent(closed.closed)} %{interval} of the gap above the floor is closed"
 
 
 def budget_line(budget: GapBudget) -> str:
     """What could be closed of the gap at all."""
-    at = f" in the {budget.place}" if budget.place and budget.repeatable >= MATERIAL_SHARE else ""
-    return (f"  of the squared gap: {_percent(budget.found)} % closed, {_percent(budget.repeatable)} % would be closed "
-            f"by some function of duty and state{at}, {_percent(budget.not_repeatable)} % does not repeat")
+    at = f" ({budget.place})" if budget.place and budget.repeatable >= MATERIAL_SHARE else ""
+    return (f"  of the squared gap: {plain_percent(budget.found)} % closed, {plain_percent(budget.repeatable)} % would "
+            f"be closed by some function of duty and state{at}, {plain_percent(budget.not_repeatable)} % does not "
+            "repeat")
 
 
 def of_the_gap(share: Interval) -> str:
     """A share of the gap with its 95 % interval: `62 % (55 to 70 %) of the gap`."""
-    return f"{_percent(share.value)} %{_between(share.low, share.high)} of the gap"
+    return f"{plain_percent(share.value)} %{_between(share.low, share.high)} of the gap"
 
 
 def _between(low: float, high: float) -> str:
-    return f" ({_percent(low)} to {_percent(high)} %)"
+    return f" ({plain_percent(low)} to {plain_percent(high)} %)"
 
 
-def _percent(share: float) -> int:
-    """A share in whole percent."""
-    return round(100.0 * share)
+def _spaced(text: str) -> str:
+    """A text of the page in plain characters."""
+    return text.replace("\N{NO-BREAK SPACE}", " ").replace("−", "-")
 
 
 def experiment(advice: NextExperiment) -> str:
@@ -210,8 +229,8 @@ def experiment(advice: NextExperiment) -> str:
 
 def describe(candidate: Candidate) -> str:
     """A candidate's parameters with units and 95 % intervals, and its share of the gap."""
-    texts = [f"{name} = {p.value:.4g} ({p.low:.4g} to {p.high:.4g}) {unit_of(candidate.effect, name)}"
+    texts = [f"{name} = {plain(p.value)} ({plain(p.low)} to {plain(p.high)}) {unit_of(candidate.effect, name)}"
              for name, p in candidate.parameters.items()]
-    when = [f"; {word} at {t.value:.2f} s ({t.low:.2f} to {t.high:.2f} s)"
+    when = [f"; {word} at {plain_time(t.value)} s ({plain_time(t.low)} to {plain_time(t.high)} s)"
             for word, t in (("begins", candidate.since), ("ends", candidate.until)) if t]
     return ", ".join(texts) + "".join(when) + (f"; {of_the_gap(candidate.share)}" if candidate.share else "")

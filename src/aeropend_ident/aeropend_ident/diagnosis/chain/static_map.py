@@ -13,6 +13,7 @@ from scipy.signal import lfilter
 from aeropend_ident.diagnosis.policy import GOOD_ENOUGH
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals
+from aeropend_sim.wording import times
 
 Array = NDArray[np.float64]
 
@@ -67,6 +68,6 @@ def why_not_identified(recordings: Sequence[Signals], residuals: Mapping[str, Ar
         return ""
     rival, size = ("a constant angle", constant) if nominal > WORSE * constant else (
         "a static map of the duty with a lag", static)
-    return (f"the nominal model could not be identified: on the part that was fitted it is off by {nominal:.3g} times "
-            f"a reading's noise, {rival} only by {size:.3g} times; check the unit, sign and zero of the angle and that "
+    return (f"the nominal model could not be identified: on the part that was fitted it is off by {times(nominal)} "
+            f"a reading's noise, {rival} only by {times(size)}; check the unit, sign and zero of the angle and that "
             "the duty column is what drove the motor; steps of the duty from rest and back to 0 help most")

@@ -1,20 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The section on the effects: the candidates, the pairs that stay open, and the next experiment."""
+"""The section on what was tried: each hypothesis, how far it came and why it lost; what stays open; what to record."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-from aeropend_ident.diagnosis.document import Candidate, DiagnosisDocument, Interval, NextExperiment
-from aeropend_ident.diagnosis.report.number_format import interval, minus, percent, with_unit
+from aeropend_ident.diagnosis.document import CANNOT_TELL, Candidate, DiagnosisDocument, Interval, NextExperiment
+from aeropend_ident.diagnosis.report.number_format import interval, minus, percent, probability, with_unit
+from aeropend_ident.diagnosis.report.sentence import NONE, SAME_END
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
 from aeropend_sim.model.parameters import PARAMETERS
 
-SAME_END = 1e-3
-"""Width of the interval of a share below which the interval is not shown (derived: its ends would be the same text)."""
-
 PROBABLE = 0.01
 """Probability from which a candidate is always visible (choice)."""
+
+AT_LEAST = 5
+"""Hypotheses that are visible at least, if there are as many: of the improbable ones those that leave the least gap
+(choice)."""
+
+LARGER = 0.05
+"""Share by which a gap must be larger than that of the verdict to be called larger (choice)."""
+
+AT_END = 1e-3
+"""Share of the end of a range within which a value is at it (choice: a bounded fit stops there)."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +46,11 @@ class CandidateRow:
         physics: what it is, in words.
         probability: [0..1] among its rivals.
         estimates: of its parameters.
-        gap_after: [share of the spread] total gap with it; None if it was not computed.
+        gap_after: [share of the spread] total gap with it; None if it is not known.
+        closes: share of the gap that it closes, as a text.
         found: whether it is part of the verdict.
         share: of the gap, as a text; "" if it is not in the augmented model.
+        lost: why it is not part of the verdict, as a text; "" if it is.
         when: it begins or ends, as a text; "" if it acts all the time.
     """
 
@@ -50,8 +61,10 @@ class CandidateRow:
     probability: float
     estimates: list[Estimate]
     gap_after: float | None
+    closes: str
     found: bool
     share: str
+    lost: str
     when: str
 
     @property
@@ -61,19 +74,29 @@ class CandidateRow:
 
 
 @dataclass(frozen=True)
+class OpenPair:
+    """Two hypotheses that the recordings cannot separate: their names, and how close they are, in words."""
+
+    names: tuple[str, str]
+    how: str
+
+
+@dataclass(frozen=True)
 class Candidates:
     """The content of the section.
 
     Attributes:
         shown: rows that are always visible.
         others: rows that a click shows.
-        not_separable: pairs of names.
+        nothing: why nothing was tried; "" if something was.
+        not_separable: pairs that concern the verdict.
         advice: the next experiment.
     """
 
     shown: list[CandidateRow]
     others: list[CandidateRow]
-    not_separable: tuple[tuple[str, str], ...]
+    nothing: str
+    not_separable: list[OpenPair]
     advice: NextExperiment | None
 
 
@@ -96,9 +119,17 @@ def share_text(share: Interval) -> str:
     return f"{percent(share.value)} ({percent(share.low)} to {percent(share.high)})"
 
 
+def open_pairs(document: DiagnosisDocument) -> list[tuple[str, str]]:
+    """The pairs of hypotheses that stay open and concern the verdict: one of the two is part of it."""
+    which = document.which
+    claimed = {c.effect for c in which.candidates if c.found}
+    claimed |= {f"{c.effect}:{name}" for c in which.candidates if c.found for name in c.parameters}
+    return [pair for pair in which.not_separable if claimed & set(pair)]
+
+
 def rows(document: DiagnosisDocument) -> list[CandidateRow]:
     """All candidates."""
-    return [_row(c) for c in document.which.candidates]
+    return [_row(document, c) for c in document.which.candidates]
 
 
 def section(document: DiagnosisDocument, candidates: list[CandidateRow]) -> Candidates:
@@ -109,11 +140,45 @@ def section(document: DiagnosisDocument, candidates: list[CandidateRow]) -> Cand
         candidates: all rows.
     """
     shown = [c for c in candidates if c.found or c.share or c.probability >= PROBABLE]
+    closest = sorted((c for c in candidates if c not in shown), key=_distance)[:max(AT_LEAST - len(shown), 0)]
+    shown = [c for c in candidates if c in shown or c in closest]
     others = [c for c in candidates if c not in shown]
-    return Candidates(shown, others, document.which.not_separable, document.which.next_experiment)
+    nothing = "" if candidates else (
+        "No effect was tried, since the nominal model could not be identified." if document.which.verdict == CANNOT_TELL
+        else "No effect was tried: refitted parameters leave too little of the gap.")
+    pairs = [OpenPair(pair, _how_close(document, pair)) for pair in open_pairs(document)]
+    return Candidates(shown, others, nothing, pairs, document.which.next_experiment if pairs else None)
 
 
-def _row(c: Candidate) -> CandidateRow:
+def why_lost(document: DiagnosisDocument, c: Candidate) -> str:
+    """Why a hypothesis is not part of the verdict, in a few words; "" if it is.
+
+    Args:
+        document: of the diagnosis.
+        c: the hypothesis.
+    """
+    if c.found:
+        return ""
+    if c.share is not None:
+        if c.share.low <= 0.0:
+            return "its share of the gap is not surely above 0"
+        return "its share of the gap is too small, or too unsure, to be claimed"
+    reasons = [f"{name} is at the end of its range" for name in _at_an_end(c)]
+    if c.behind is not None:
+        reasons.append(f"less evidence than {c.behind.rpartition(':')[2]}")
+    elif c.evidence is not None and c.evidence <= 0.0:
+        reasons.append("no more evidence than without it")
+    closure = document.closure
+    if c.gap_after is not None and c.gap_after >= closure.gap:
+        reasons.append("does not make the gap smaller")
+    elif c.gap_after is not None and c.gap_after > (1.0 + LARGER) * max(closure.gap_after, closure.floor):
+        reasons.append("leaves a larger gap")
+    if document.which.verdict == "unknown" and not reasons:
+        reasons.append("leaves a misfit that repeats")
+    return "; ".join(reasons) or "too improbable"
+
+
+def _row(document: DiagnosisDocument, c: Candidate) -> CandidateRow:
     parameter = next(iter(c.parameters), "") if c.effect == PARAMETER_MISMATCH else ""
     estimates = []
     for name, q in c.parameters.items():
@@ -121,8 +186,45 @@ def _row(c: Candidate) -> CandidateRow:
         estimates.append(Estimate(name, with_unit(value, unit_of(c.effect, name)), between))
     physics = minus(f"{PARAMETERS[f'model.{parameter}'].description}; its value is off" if parameter
                     else CATALOGUE[c.effect].physics)
-    return CandidateRow(c.effect, parameter, c.place, physics, c.probability, estimates, c.gap_after, c.found,
-                        share_text(c.share) if c.share else "", _when(c))
+    return CandidateRow(c.effect, parameter, c.place, physics, c.probability, estimates, c.gap_after,
+                        _closes(document, c), c.found, share_text(c.share) if c.share else "", why_lost(document, c),
+                        _when(c))
+
+
+def _closes(document: DiagnosisDocument, c: Candidate) -> str:
+    """The share of the gap that a hypothesis closes, as a text."""
+    gap, floor = document.closure.gap, document.closure.floor
+    if c.gap_after is None or document.closure.closed is None or not gap > floor:
+        return ""
+    share = min((gap - c.gap_after) / (gap - floor), 1.0)
+    return "closes none" if share < NONE else f"closes {percent(share)}"
+
+
+def _at_an_end(c: Candidate) -> list[str]:
+    """The parameters of an effect that are at an end of their range, apart from the value without the effect."""
+    if c.effect == PARAMETER_MISMATCH:
+        return []
+    known = CATALOGUE[c.effect].parameters
+    return [name for name, q in c.parameters.items() for end in (known[name].low, known[name].high)
+            if end != known[name].neutral and abs(q.value - end) <= AT_END * abs(end)]
+
+
+def _how_close(document: DiagnosisDocument, pair: tuple[str, str]) -> str:
+    """How close two hypotheses are: probability and gap of each."""
+    texts = []
+    for name in pair:
+        effect, _, parameter = name.partition(":")
+        mine = next((c for c in document.which.candidates
+                     if c.effect == effect and (not parameter or parameter in c.parameters)), None)
+        if mine is not None:
+            texts.append(f"{parameter or effect}: probability {probability(mine.probability)}, "
+                         f"gap after {percent(mine.gap_after)}")
+    return "; ".join(texts)
+
+
+def _distance(c: CandidateRow) -> float:
+    """Sort key: the hypotheses that leave the least gap come first."""
+    return math.inf if c.gap_after is None or math.isnan(c.gap_after) else c.gap_after
 
 
 def _when(c: Candidate) -> str:

@@ -13,17 +13,14 @@ from aeropend_ident.diagnosis.report import gap
 from aeropend_ident.diagnosis.report.candidates import CandidateRow
 from aeropend_ident.diagnosis.report.number_format import percent, quantity
 from aeropend_ident.diagnosis.report.parameters import OFF, ParameterRowText
+from aeropend_ident.diagnosis.report.sentence import CLOSED, RANDOM
 from aeropend_ident.diagnosis.report.variables import VARIABLES
-from aeropend_ident.diagnosis.report.verdict import RANDOM
 from aeropend_ident.signals.signals import Signals
 
 Array = NDArray[np.float64]
 
 NOT_SEPARATED = ({"electrical", "rotor"}, {"thrust", "arm", "sensing"})
 """Places between which no signal is measured."""
-
-CLOSED = 0.9
-"""Share of the gap that an effect of the right form closes at least (choice)."""
 
 SHORT = 30.0
 """[s] Fitted data below which a recording is called short (choice)."""
@@ -58,7 +55,7 @@ def _data(document: DiagnosisDocument, recordings: Sequence[Signals]) -> Iterato
     if notes:
         yield f"{notes} {'note describes' if notes == 1 else 'notes describe'} unusual data: see the end of the page."
     fitted = sum(s.train * s.period for s in recordings)
-    if fitted < SHORT:
+    if round(fitted) < SHORT:  # as the sentence rounds it
         yield (f"Only {quantity(fitted, 's', 2)} of data were fitted; {quantity(SHORT, 's', 2)} or more give a surer "
                "verdict.")
     driven = any(s.driven for s in recordings)
@@ -66,7 +63,8 @@ def _data(document: DiagnosisDocument, recordings: Sequence[Signals]) -> Iterato
         spread = max(_range(s.channel(name)) for s in recordings)
         if spread < least and (driven or name != "duty"):
             v = VARIABLES[name]
-            yield f"The {v.name} varied by only {quantity(spread, v.unit, 2)}: most effects hardly show in this range."
+            range_ = f"varied by only {quantity(spread, v.unit, 2)}" if spread > 0.0 else "stayed the same"
+            yield f"The {v.name} {range_}: most effects hardly show in this range."
 
 
 def _effects(document: DiagnosisDocument, found: Sequence[CandidateRow]) -> Iterator[str]:

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.diagnosis import Diagnosis
-from aeropend_ident.diagnosis.document import Curve, DiagnosisDocument, UnknownEffect
+from aeropend_ident.diagnosis.document import CANNOT_TELL, Curve, DiagnosisDocument, UnknownEffect
 from aeropend_ident.diagnosis.report.binned import variable
 from aeropend_ident.diagnosis.report.drawing import HEIGHT, WIDTH, from_top, grid
-from aeropend_ident.diagnosis.report.number_format import Tick, quantity, ticks, with_unit
+from aeropend_ident.diagnosis.report.number_format import MOST, Tick, percent, quantity, ticks, with_unit
 from aeropend_ident.diagnosis.report.variables import VARIABLES, Variable
 from aeropend_ident.signals.statistics import rms
 
@@ -37,6 +37,11 @@ NOTHING = 0.1
 
 JUMP = 0.55
 """Share of a curve's height between two neighbouring knots from which the text mentions them (choice)."""
+
+WHOLE = 1.0
+"""Share of the thrust at which a curve is cut off.
+
+Derived: at -100 % no thrust is left. A free curve goes beyond it only where there is hardly any thrust to show it."""
 
 STEP = 1e-3
 """Change of the duty between two samples from which it is a step (choice)."""
@@ -112,6 +117,7 @@ class _Curve:
         line: (K,) that straight line, 0 where no parameter does as well.
         amount: RMS of what the curve does in the recording, in units of the place.
         slant: the same of the line.
+        cut: whether values beyond `WHOLE` were cut off.
     """
 
     name: str
@@ -121,17 +127,18 @@ class _Curve:
     line: Array
     amount: float
     slant: float = 0.0
+    cut: bool = False
 
 
 def section(diagnosis: Diagnosis, document: DiagnosisDocument) -> Unknown | None:
-    """The content of the section; None if there is no unknown effect.
+    """The content of the section; None if no unknown effect is part of the verdict.
 
     Args:
         diagnosis: the diagnosis.
         document: its document.
     """
     unknown = document.which.unknown
-    if unknown is None:
+    if unknown is None or document.which.verdict == CANNOT_TELL:
         return None
     n = diagnosis.augmented.model
     speed, current = (np.concatenate([np.asarray(r[c]) for r in diagnosis.after]) for c in ("omega", "i_a"))
@@ -194,7 +201,7 @@ def _curve(row: tuple[str, str, Array, Array], factors: Factors, fitted: float) 
         inside = x < fitted
         if 0 < inside.sum() < len(x):
             x, y = np.append(x[inside], fitted), np.append(y[inside], y[inside][-1])
-    if len(x) < 2 or not np.isfinite(y).all():
+    if len(x) < 2 or not (np.abs(y) < MOST).all():
         return None
     line = np.zeros(len(x))
     if over == "steps":
@@ -209,7 +216,11 @@ def _curve(row: tuple[str, str, Array, Array], factors: Factors, fitted: float) 
         line = np.asarray(np.polyval(np.polyfit(x, y, 1, w=np.sqrt(weight)), x), dtype=np.float64)
     # constants move freely between curves and parameters: drawn from where the variable is zero
     bend = y - line
-    return _Curve(name, unit, x, bend - np.interp(np.clip(0.0, x[0], x[-1]), x, bend), line, amount(bend), amount(line))
+    drawn = bend - np.interp(np.clip(0.0, x[0], x[-1]), x, bend)
+    cut = unit == "-" and bool((np.abs(drawn) > WHOLE).any())
+    if cut:  # from the middle of its values, which the wild ones do not move
+        drawn = bend = np.clip(bend - np.median(bend), -WHOLE, WHOLE)
+    return _Curve(name, unit, x, drawn, line, amount(bend), amount(line), cut)
 
 
 def _picture(c: _Curve, place: str, span: float, most: float) -> CurvePicture:
@@ -228,6 +239,8 @@ def _picture(c: _Curve, place: str, span: float, most: float) -> CurvePicture:
     if c.slant > NOTHING * most:
         rise = quantity(scale * float(c.line[-1] - c.line[0]), unit, 2)
         text += f"; in addition a straight line, {rise} from end to end, that parameters of the model can describe"
+    if c.cut:
+        text += f"; it is cut off at {percent(WHOLE)}, where there is too little thrust to show it"
     marks = from_top(ticks(scale * low, scale * high, 5))
     return CurvePicture(v, term, unit, f"{text[:1].upper()}{text[1:]}.",
                         f"{term} against {v.phrase}, a curve with {len(c.x)} knots: {text}", "M" + "L".join(points),

@@ -23,6 +23,11 @@ GAP = 5.0
 """Distance between two readings, in their usual distance, from which they are not connected (choice)."""
 
 
+def position(share: float) -> float:
+    """[%] Place of a share on a bar: within the bar, at its start if it is not known."""
+    return 100.0 * min(max(share, 0.0), 1.0) if not math.isnan(share) else 0.0
+
+
 def limits(lines: Iterable[Array], *, around_zero: bool = False) -> tuple[float, float]:
     """Lower and upper end of an axis.
 

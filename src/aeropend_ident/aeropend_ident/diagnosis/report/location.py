@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -12,7 +13,7 @@ from aeropend_ident.diagnosis.document import CANNOT_TELL, DiagnosisDocument, Re
 from aeropend_ident.diagnosis.regions import Misfit
 from aeropend_ident.diagnosis.report.binned import AGAINST, Binned, Cell, binned, cell, varies
 from aeropend_ident.diagnosis.report.candidates import CandidateRow
-from aeropend_ident.diagnosis.report.drawing import WIDTH
+from aeropend_ident.diagnosis.report.drawing import WIDTH, position
 from aeropend_ident.diagnosis.report.number_format import ends, with_unit
 from aeropend_ident.diagnosis.report.variables import VARIABLES, Variable
 from aeropend_sim.model.effects import PLACES
@@ -28,6 +29,7 @@ class Place:
     Attributes:
         name: its name.
         share: [0..1] of the gap.
+        filled: [%] of the box that shows it.
         output: symbol of what it hands on.
         main: whether it is the place of the verdict.
         found: names of what was found there.
@@ -35,6 +37,7 @@ class Place:
 
     name: str
     share: float
+    filled: float
     output: str
     main: bool
     found: list[str]
@@ -85,7 +88,8 @@ def section(document: DiagnosisDocument, misfit: Misfit, candidates: Sequence[Ca
         candidates: all rows.
     """
     where = document.where
-    places = [Place(name, where.share.get(name, 0.0), OUTPUT_OF[name], name == where.place,
+    share = {name: where.share.get(name, 0.0) for name in PLACES}
+    places = [Place(name, share[name], position(share[name]), OUTPUT_OF[name], name == where.place,
                     [c.name for c in candidates if c.found and c.place == name]) for name in PLACES]
     found = document.which.verdict not in ("none", CANNOT_TELL)
     return Location(found, places, [_text(r) for r in where.regions],
@@ -106,7 +110,7 @@ def _cells(misfit: Misfit, regions: Sequence[Region]) -> list[Cell]:
 
 
 def _cell(name: str, errors: Binned, reach: float, regions: Sequence[Region]) -> Cell:
-    mine = [r for r in regions if r.variable == name]
+    mine = [r for r in regions if r.variable == name and math.isfinite(r.high - r.low)]
     start, width = errors.edges[0], float(errors.edges[-1] - errors.edges[0])
     marked = [np.clip([(x - start) / width for x in (r.low, r.high)], 0.0, 1.0) for r in mine]
     named = "".join(f"; the range from {' to '.join(ends(r.low, r.high))} stands out" for r in mine)

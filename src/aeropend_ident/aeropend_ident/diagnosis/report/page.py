@@ -55,7 +55,8 @@ class Origin:
     Attributes:
         command: the command line.
         bags: the recordings.
-        model: the nominal model.
+        nominal: the nominal model, in a few words.
+        start: where it comes from.
         seconds: [s] time taken.
         versions: of the software.
         date: of the page.
@@ -63,7 +64,8 @@ class Origin:
 
     command: str
     bags: Sequence[str]
-    model: str
+    nominal: str
+    start: str
     seconds: float
     versions: Sequence[str]
     date: str
@@ -85,7 +87,7 @@ def render(diagnosis: Diagnosis, document: DiagnosisDocument, command: str) -> s
                               keep_trailing_newline=True, undefined=StrictUndefined)
     environment.filters.update(quantity=quantity, percent=percent, probability=probability)
     rows, table = candidates.rows(document), parameters.section(document)
-    origin = Origin(command, document.bags, document.model, document.seconds, _versions(),
+    origin = Origin(command, document.bags, *_nominal(document), document.seconds, _versions(),
                     datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %z"))
     return environment.get_template("page.html.j2").render(
         width=WIDTH, height=HEIGHT, origin=origin, verdict=verdict.section(document, rows),
@@ -99,6 +101,14 @@ def render(diagnosis: Diagnosis, document: DiagnosisDocument, command: str) -> s
 def _recordings(document: DiagnosisDocument, recordings: Sequence[Signals]) -> list[RecordingText]:
     return [RecordingText(bag, s.notes, len(s) * s.period, s.samples, s.train * s.period)
             for bag, s in zip(document.bags, recordings, strict=False)]
+
+
+def _nominal(document: DiagnosisDocument) -> tuple[str, str]:
+    """The nominal model in a few words, and where it comes from."""
+    if document.identified is None:
+        return f"model {document.model}", document.model
+    basis = f"identified from {'these recordings' if len(document.bags) > 1 else 'this recording'}"
+    return f"model {basis}", f"{basis}, starting at {document.model}"
 
 
 def _versions() -> list[str]:

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-from aeropend_ident.diagnosis.document import DiagnosisDocument
+from aeropend_ident.diagnosis.document import DiagnosisDocument, Lift
 from aeropend_ident.diagnosis.report.number_format import exact, interval, quantity
 from aeropend_sim.model.parameters import parameter
 
@@ -13,6 +14,9 @@ OFF = 0.05
 """Relative shift above which a parameter is marked.
 
 Derived: the tolerance that the priors of calibrated rigs assume."""
+
+NO_DEAD_ZONE = 0.005
+"""Duty below which a dead zone is none (choice: half of the change that counts as no excitation)."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +84,8 @@ class Parameters:
     identified: IdentifiedText | None
 
     def at(self, shift: float) -> float:
-        """[%] Position of a shift in the picture."""
-        return 50.0 + 50.0 * min(max(shift / self.reach, -1.0), 1.0)
+        """[%] Position of a shift in the picture; in the middle if it is not known."""
+        return 50.0 if math.isnan(shift) else 50.0 + 50.0 * min(max(shift / self.reach, -1.0), 1.0)
 
     @property
     def band(self) -> float:
@@ -101,8 +105,21 @@ def section(document: DiagnosisDocument) -> Parameters:
         shift, low, high = ((x - n.nominal) / scale for x in (n.value, n.low, n.high))
         rows.append(ParameterRowText(name, "" if p.unit == "-" else p.unit, p.description, exact(n.nominal), value,
                                      between, shift, low, high, abs(shift) > OFF))
-    reach = max([2.0 * OFF, *(1.05 * min(abs(x), 1.0) for r in rows for x in (r.shift, r.low, r.high))])
+    shifts = [x for r in rows for x in (r.shift, r.low, r.high) if math.isfinite(x)]
+    reach = max([2.0 * OFF, *(1.05 * min(abs(x), 1.0) for x in shifts)])
     return Parameters(rows, reach, f"{100.0 * OFF:g}", _identified(document))
+
+
+def lift_text(lift: Lift, duration: float) -> str:
+    """The lift of the duty, in words.
+
+    Args:
+        lift: the curve.
+        duration: [s] of the recordings; they do not show a longer lag.
+    """
+    dead = f", none below {quantity(lift.dead_zone, digits=2)}" if lift.dead_zone >= NO_DEAD_ZONE else ""
+    lag = f"of {quantity(lift.lag_s, 's', 2)}" if lift.lag_s < duration else "longer than the recording"
+    return f"up to {quantity(lift.rad_per_s2[-1], 'rad/s²')} at a duty of {lift.duty[-1]:.2f}{dead}, with a lag {lag}"
 
 
 def _identified(document: DiagnosisDocument) -> IdentifiedText | None:
@@ -114,7 +131,6 @@ def _identified(document: DiagnosisDocument) -> IdentifiedText | None:
     hangs, lift = identified.hangs_at, identified.lift
     if hangs and hangs.run_to_run:
         spread.append(f"the angle where the arm hangs by {quantity(hangs.run_to_run, 'rad', 2)}")
-    curve = (f"up to {quantity(lift.rad_per_s2[-1], 'rad/s²')} at a duty of {lift.duty[-1]:.2f}, none below "
-             f"{lift.dead_zone:.2f}, with a lag of {quantity(lift.lag_s, 's', 2)}" if lift else "")
+    curve = lift_text(lift, document.duration_s) if lift else ""
     return IdentifiedText(identified.basis, identified.not_determined, ", ".join(spread),
                           quantity(hangs.value, "rad", 2) if hangs else "", curve)

@@ -11,7 +11,7 @@ from aeropend_ident.diagnosis.diagnosis import Diagnosis
 from aeropend_ident.diagnosis.document import Channel, DiagnosisDocument
 from aeropend_ident.diagnosis.report.binned import AGAINST, Array, Cell, binned, cell, variable, varies
 from aeropend_ident.diagnosis.report.drawing import HEIGHT
-from aeropend_ident.diagnosis.report.number_format import quantity
+from aeropend_ident.diagnosis.report.number_format import LEAST, MOST, quantity
 from aeropend_ident.diagnosis.report.traces import held_out
 from aeropend_ident.diagnosis.report.variables import VARIABLES, Variable
 
@@ -58,6 +58,7 @@ def _row(shown: Variable, channel: Channel, against: dict[str, Array], before: A
     known = np.isfinite(before) & np.isfinite(after)
     each = {name: binned(x, before, after) for name, x in against.items() if varies(x[known])}
     largest = [x for errors in each.values() if (x := errors.largest()) is not None]
-    reach = 1.15 * max([2.0 * channel.floor, *largest])
+    noise = channel.floor if 0.0 < channel.floor < MOST else 0.0
+    reach = 1.15 * max([LEAST, 2.0 * noise, *(x for x in largest if x < MOST)])
     return ResidualRow(shown, quantity(reach, shown.unit, 2), [cell(name, e, reach, shown) for name, e in each.items()],
-                       HEIGHT * (0.5 - channel.floor / reach), HEIGHT * 2.0 * channel.floor / reach)
+                       HEIGHT * (0.5 - noise / reach), HEIGHT * 2.0 * noise / reach)

@@ -130,9 +130,10 @@ class SelectionRound:
         return ranked[:SHORTLIST] + misplaced
 
     def _misplaced(self, h: Hypothesis) -> bool:
-        name, chains = h.own[0].name, self.chains
-        return chains.policy.calibrated and name in self.current.values and abs(
-            self.current.values[name] - neutral(chains.model, name)) > MISPLACED * nominal_sd(chains, name)
+        chains, now = self.chains, self.current.values
+        return chains.policy.calibrated and any(
+            abs(now[p.name] - neutral(chains.model, p.name)) > MISPLACED * nominal_sd(chains, p.name)
+            for p in h.own if p.name in now)
 
     def warm_started(self, tried: FittedHypotheses) -> tuple[FittedHypotheses, Hypothesis | None]:
         """Fit the best to its end and start the others again from its parameters.
