@@ -69,8 +69,7 @@ def test_friction_that_grew_is_named(monday):
     assert change.before.low < FRICTION < change.before.high
     assert change.change.low < FRICTION < change.change.high
     assert found.which.effects == ("coulomb_friction",)
-    text = "\n".join(since.lines(found.since))
-    assert "changed since monday: coulomb_friction.accel" in text
+    assert since.lines(found.since)[0].startswith("  changed: coulomb_friction.accel 0.4")
 
 
 @pytest.mark.promise("What has changed", "A mass on the arm is named by weight, lever and damping over its inertia")
@@ -120,10 +119,13 @@ def test_the_command_says_what_has_changed(monday, tmp_path, capsys):
     bags.write(bag, columns_of(stronger, 503), round(SAMPLE_PERIOD * 1e9))
     out = tmp_path / "verdict"
     assert command.main([str(bag), "--since", str(monday), "--out", str(out)]) == 0
-    assert "changed since monday: coulomb_friction.accel" in capsys.readouterr().out
+    assert "since monday, this has changed: coulomb_friction.accel (arm)" in capsys.readouterr().out
     body = json.loads((out / "diagnosis.json").read_text())
     assert [c["name"] for c in body["since"]["changes"] if c["claimed"]] == ["coulomb_friction.accel"]
     assert body["model"] == str(monday)
+    page = (out / "report.html").read_text()
+    assert "Since monday, this has changed" in page
+    assert "What has changed since monday" in page
 
 
 def test_a_verdict_without_estimates_is_refused_in_one_line(monday, tmp_path):

@@ -124,7 +124,9 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
     headline = "".join(part.text for part in sentence.verdict(document))
     why = "; ".join(which.unexplained)
     lines = []
-    if which.verdict == "none":
+    if document.since is not None and which.verdict not in ("unknown", CANNOT_TELL):
+        lines.append(since.verdict_line(document.since, document.where.place))
+    elif which.verdict == "none":
         lines.append(f"verdict: none. {_spaced(headline)}")
     elif which.verdict == CANNOT_TELL:
         lines.append(f"verdict: cannot tell. {why[:1].upper()}{why[1:]}.")

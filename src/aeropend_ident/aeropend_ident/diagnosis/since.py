@@ -176,13 +176,18 @@ def _interval(value: float, sd: float) -> Interval:
     return Interval(value, value - Z95 * sd, value + Z95 * sd)
 
 
+def verdict_line(since: Since, place: str) -> str:
+    """The verdict for the terminal."""
+    named, changed = " and ".join(since.verdicts), [c.name for c in since.changes if c.claimed]
+    if not changed:
+        return f"verdict: nothing has changed since {named} that the recording shows"
+    return f"verdict: since {named}, this has changed: {', '.join(changed)} ({place})"
+
+
 def lines(since: Since) -> list[str]:
     """What has changed, in lines for the terminal."""
-    named = " and ".join(since.verdicts)
     changed = sorted(since.changes, key=lambda c: not c.claimed)
-    out = [f"  {'changed' if c.claimed else 'small change'} since {named}: {described(c)}" for c in changed]
-    if not changed:
-        out.append(f"  nothing has changed since {named} that the recording shows")
+    out = [f"  {'changed' if c.claimed else 'small change'}: {described(c)}" for c in changed]
     same = [f"{name} (at most {_farthest(x)})" for name, x in since.unchanged.items()]
     if same:
         out.append(f"  not changed: {', '.join(same)}")

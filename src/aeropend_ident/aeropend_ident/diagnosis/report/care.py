@@ -85,7 +85,7 @@ def _effects(document: DiagnosisDocument, found: Sequence[CandidateRow]) -> Iter
 def _shifts(document: DiagnosisDocument, found: Sequence[CandidateRow], parameters: Sequence[ParameterRowText]
             ) -> Iterator[str]:
     """Parameters that are surely off and not part of the verdict."""
-    claimed = {c.parameter for c in found}
+    claimed = {e.name for c in found for e in c.estimates}
     moved = [p.name for p in parameters if p.name not in claimed and (p.low > OFF or p.high < -OFF)]
     if moved and document.identified is None:
         advice = "Check them in the model file."

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from aeropend_ident.diagnosis.document import CANNOT_TELL, ClosedGap, DiagnosisDocument
+from aeropend_ident.diagnosis.document import CANNOT_TELL, ClosedGap, DiagnosisDocument, Since
 from aeropend_ident.diagnosis.policy import GOOD_ENOUGH
 from aeropend_ident.diagnosis.report.number_format import percent, quantity
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
@@ -70,6 +70,8 @@ def verdict(document: DiagnosisDocument) -> list[Part]:
     if which.verdict == CANNOT_TELL:
         reason = _reason(which.unexplained)[0]
         return [Part(f"Cannot tell: {reason}." if reason else "Cannot tell which effect the model lacks.")]
+    if document.since is not None and which.verdict != "unknown":
+        return _since(document.since)
     quiet = "; the gap is within the noise of the readings." if reached == "nothing open" else "."
     if which.verdict == "unknown":
         beside = [Part(", beside "), *listed([*effects, *parameters])] if effects or parameters else []
@@ -84,6 +86,14 @@ def verdict(document: DiagnosisDocument) -> list[Part]:
                 f"recording, but {'close' if several else 'closes'} none of the gap on held-out data.")]
     left = f"; {open_} of the gap stays open." if reached in ("part", "none") else quiet
     return [*_claim(effects, parameters, complete=left == "."), Part(left)]
+
+
+def _since(since: Since) -> list[Part]:
+    """What has changed since earlier verdicts."""
+    named, changed = " and ".join(since.verdicts), [c.name for c in since.changes if c.claimed]
+    if not changed:
+        return [Part(f"Nothing has changed since {named} that this recording shows.")]
+    return [Part(f"Since {named}, this has changed: "), *listed(changed), Part(".")]
 
 
 def _claim(effects: Sequence[str], parameters: Sequence[str], *, complete: bool) -> list[Part]:
@@ -154,8 +164,8 @@ def _tests(document: DiagnosisDocument) -> str:
 
 def _parameters(document: DiagnosisDocument) -> list[str]:
     """The parameters of the model that are part of the verdict."""
-    return [next(iter(c.parameters)) for c in document.which.candidates
-            if c.found and c.effect == PARAMETER_MISMATCH and c.parameters]
+    return [name for c in document.which.candidates if c.found and c.effect == PARAMETER_MISMATCH
+            for name in c.parameters]
 
 
 def _reason(reasons: Sequence[str]) -> tuple[str, str]:
