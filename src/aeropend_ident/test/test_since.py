@@ -51,7 +51,7 @@ def tuesday(monday, model: Model, seed: int = 503) -> Diagnosis:
     return diagnose(nominal, [recorded(model, seed)], 2, known=known)
 
 
-@pytest.mark.promise("What has changed", "Nothing is claimed of a rig that has not changed")
+@pytest.mark.promise("Verdict", "Nothing is claimed of a rig that has not changed")
 def test_nothing_has_changed(monday):
     found = tuesday(monday, RIG).conclusions
     assert found.which.verdict == "none"
@@ -61,7 +61,7 @@ def test_nothing_has_changed(monday):
         assert max(abs(found.since.unchanged[name].low), abs(found.since.unchanged[name].high)) < 0.02
 
 
-@pytest.mark.promise("What has changed", "An effect that grew is named, with its size before and after")
+@pytest.mark.promise("Verdict", "An effect that grew is named, with its size before and after")
 def test_friction_that_grew_is_named(monday):
     found = tuesday(monday, RIG.with_effects({"coulomb_friction": {"accel": 2.0 * FRICTION}})).conclusions
     (change,) = [c for c in found.since.changes if c.claimed]
@@ -72,7 +72,7 @@ def test_friction_that_grew_is_named(monday):
     assert since.lines(found.since)[0].startswith("  changed: coulomb_friction.accel 0.4")
 
 
-@pytest.mark.promise("What has changed", "A mass on the arm is named by weight, lever and damping over its inertia")
+@pytest.mark.promise("Verdict", "A mass on the arm is named by weight, lever and damping over its inertia")
 def test_a_mass_on_the_arm_is_named(monday):
     heavier = replace(RIG, model={k: v * WITH_A_MASS.get(k, 1.0) for k, v in RIG.model.items()})
     found = tuesday(monday, heavier).conclusions.since
@@ -89,7 +89,7 @@ def test_a_product_is_known_although_its_factors_are_not(monday):
     assert np.sqrt(relative.sum()) < 0.003
 
 
-@pytest.mark.promise("What has changed", "Several earlier verdicts show how far the rig differs from run to run")
+@pytest.mark.promise("Verdict", "Several earlier verdicts show how far the rig differs from run to run")
 def test_scatter_between_verdicts_widens_what_is_known():
     one, two = (Known(("R_a", "K_e"), np.array([r, 0.006]), np.diag([1e-6, 1e-12]), (name,))
                 for r, name in ((1.00, "monday"), (1.10, "wednesday")))
@@ -112,7 +112,7 @@ def test_a_parameter_that_replaces_another_is_not_correlated():
     assert prior_information(replaced) == pytest.approx(np.eye(2))
 
 
-@pytest.mark.promise("What has changed", "`diagnose --since` takes the folder of an earlier verdict")
+@pytest.mark.promise("Verdict", "`diagnose --since` takes the folder of an earlier verdict")
 def test_the_command_says_what_has_changed(monday, tmp_path, capsys):
     bag = tmp_path / "tuesday"
     stronger = RIG.with_effects({"coulomb_friction": {"accel": 2.0 * FRICTION}})

@@ -22,7 +22,7 @@ from aeropend_ident.diagnosis.search.hypotheses import hypotheses
 from aeropend_ident.diagnosis.validation import validate
 from aeropend_ident.estimation.map_fit import estimate
 from aeropend_ident.signals.free_decay import free_swings
-from aeropend_ident.signals.from_bag import from_uncalibrated
+from aeropend_ident.signals.from_bag import as_signals, from_uncalibrated
 from aeropend_ident.signals.grid import irregular_grid
 from aeropend_ident.signals.noise import reading_noise_at, resolution, white_noise_at
 from aeropend_ident.signals.signals import Signals
@@ -373,3 +373,26 @@ def test_the_command_says_in_one_line_why_it_cannot_tell(tmp_path, capsys):
     assert error.count("\n") == 1
     assert "no verdict is possible without the command" in error
     assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture(scope="module")
+def with_voltage():
+    duty = steps(30.0, 4)
+    columns, _ = rig.record(drawn_rig(4, {}), duty, 4)
+    return np.arange(len(duty)) * SAMPLE_PERIOD, columns["theta"], columns["v_a"]
+
+
+@pytest.mark.promise("Uncalibrated rigs", "Where no command was recorded, a measured voltage takes its place")
+def test_a_measured_voltage_stands_for_the_command(with_voltage):
+    t, theta, v_a = with_voltage
+    s = as_signals(recording(t, theta, v_a=v_a), BENCH.sensing, fit_nominal=True)
+    assert s.driven
+    assert np.corrcoef(s.duty, v_a[:len(s)])[0, 1] > 0.999
+    assert not s.has("v_a")
+    assert any("the voltage over its largest value" in note for note in s.notes)
+
+
+def test_a_voltage_in_both_directions_is_refused_in_one_line(with_voltage):
+    t, theta, v_a = with_voltage
+    with pytest.raises(RecordingError, match="driven one way"):
+        as_signals(recording(t, theta, v_a=v_a - 1.0), BENCH.sensing, fit_nominal=True)

@@ -94,6 +94,7 @@ def changes(known: Known, joint: JointFit, claimed: Container[str]) -> Since:
         before, after = neutral(model, name), joint.values[name]
         new = key(name).owner in CATALOGUE and key(name).owner not in model.effects
         _, sd = compared.change(name, found)
+        sd = math.hypot(sd, _from_form(joint, name))
         changed.append(Change(name, limits(name).unit, None if new else _interval(before, known.sd(name)),
                               _interval(after, joint.sd[name]), _interval(after - before, sd), material))
     same, open_ = {}, []
@@ -106,6 +107,11 @@ def changes(known: Known, joint: JointFit, claimed: Container[str]) -> Since:
             else:
                 same[name] = _interval(off / before, sd / before)
     return Since(known.verdicts, tuple(changed), same, tuple(open_))
+
+
+def _from_form(joint: JointFit, name: str) -> float:
+    """The part of a standard deviation that comes from the form of an effect, and from how recordings differ."""
+    return math.sqrt(max(joint.sd[name] ** 2 - (WIDER * joint.fit.sd[name]) ** 2, 0.0))
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,9 @@ MOVES = 3.0
 Measured: at ±30 % no verdict of 5 recordings changes (docs/results/thresholds.md)."""
 
 
+BACKWARDS = 0.02
+"""Voltage of the other sign, over the largest, that is no drive in both directions (choice: an offset)."""
+
 RESTS, SETTLES, MOSTLY = 0.02, 0.05, 0.5
 """Change of angle and duty, over their range, that is rest; time after the last motion, over that before it, that is
 kept; and share of the held-out part that rests from which on it is left out (choice)."""
@@ -93,7 +96,29 @@ def as_signals(read: Recording, sensing: Mapping[str, float], held_out: float = 
         return from_recording(longest_piece(read), sensing, held_out)
     if len(read) < FEWEST:
         raise RecordingError(f"{read.path}: {len(read)} samples are too few for a verdict")
-    return from_uncalibrated(longest_piece(read), sensing, held_out)
+    return from_uncalibrated(longest_piece(with_voltage_as_command(read)), sensing, held_out)
+
+
+def with_voltage_as_command(read: Recording) -> Recording:
+    """A recording without commands whose voltage was measured: the voltage over the largest one is its duty.
+
+    Raises:
+        RecordingError: the voltage goes both ways; one line that says what to do.
+    """
+    v = read.v_a
+    known = np.isfinite(v)
+    if np.isfinite(read.duty).any() or known.sum() <= FEWEST:
+        return read
+    noise = reading_noise_at((read.stamp_ns - read.stamp_ns[0]) * 1e-9, v)
+    top, bottom = float(v[known].max()), float(v[known].min())
+    if top - bottom <= MOVES * noise:
+        return read
+    if bottom < -max(MOVES * noise, BACKWARDS * top):
+        raise RecordingError(f"{read.path}: the voltage goes from {bottom:.3g} to {top:.3g} V: the model's motor is "
+                             "driven one way; record with voltages of one sign")
+    said = (f"no command was recorded: the voltage over its largest value, {top:.3g} V, takes its place; nothing is said "
+            "of bridge and supply")
+    return replace(read, duty=np.clip(v / top, 0.0, 1.0), v_a=np.full(len(v), np.nan), notes=(*read.notes, said))
 
 
 def from_recording(read: Recording, sensing: Mapping[str, float], held_out: float = 0.3) -> Signals:

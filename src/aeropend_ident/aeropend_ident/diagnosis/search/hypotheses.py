@@ -52,8 +52,8 @@ Choice: what sticks at once gives no gradient."""
 STICKING = ("coulomb_friction", "rotor_friction")
 """Effects that can stick."""
 
-OF_A_MASS = ("mgd_over_J", "L_over_J", "c_over_J")
-"""Parameters that a mass on the arm changes together: it changes weight and inertia."""
+TOGETHER = (("mgd_over_J", "L_over_J", "c_over_J"), ("k_load", "J_m"))
+"""Parameters that change together: a mass on the arm changes weight and inertia, another propeller load and inertia."""
 
 SAME = 1e-6
 """Change of a residual, in units of a reading's noise, that is rounding (choice).
@@ -131,8 +131,9 @@ def _changes(model: Model, known: Known) -> Iterable[Hypothesis]:
             own = Parameter(p.name, p.mean, wide, limit.low, limit.high, start=1.1 * p.mean)
             numbers[p.name] = own
             yield Hypothesis(PARAMETER_MISMATCH, p.name, ((own,),))
-    if all(name in numbers for name in OF_A_MASS):
-        yield Hypothesis(PARAMETER_MISMATCH, OF_A_MASS[0], (tuple(numbers[name] for name in OF_A_MASS),))
+    for names in TOGETHER:
+        if all(name in numbers for name in names):
+            yield Hypothesis(PARAMETER_MISMATCH, names[0], (tuple(numbers[name] for name in names),))
     for id_, parameters in model.effects.items():
         if id_ in CATALOGUE and f"{id_}.{CATALOGUE[id_].size}" in known.names:
             size = CATALOGUE[id_].parameters[CATALOGUE[id_].size]
