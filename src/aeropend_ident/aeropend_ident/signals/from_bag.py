@@ -116,8 +116,8 @@ def with_voltage_as_command(read: Recording) -> Recording:
     if bottom < -max(MOVES * noise, BACKWARDS * top):
         raise RecordingError(f"{read.path}: the voltage goes from {bottom:.3g} to {top:.3g} V: the model's motor is "
                              "driven one way; record with voltages of one sign")
-    said = (f"no command was recorded: the voltage over its largest value, {top:.3g} V, takes its place; nothing is said "
-            "of bridge and supply")
+    said = (f"no command was recorded: the voltage over its largest value, {top:.3g} V, takes its place; nothing is "
+            "said of bridge and supply")
     return replace(read, duty=np.clip(v / top, 0.0, 1.0), v_a=np.full(len(v), np.nan), notes=(*read.notes, said))
 
 
