@@ -22,7 +22,7 @@ import numpy as np
 
 from aeropend_ident.bags.recording import read
 from aeropend_ident.commands.import_table import main as import_table
-from evaluation.habits import layouts, tables
+from evaluation.habits import layouts, tables, weights
 from evaluation.habits.tables import Drawn, Truth
 
 JUDGING = 1000
@@ -82,7 +82,11 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=JUDGING, help=f"default {JUDGING}")
     parser.add_argument("--show", type=int, metavar="N", help="print what import says about table N")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the files of table N there")
+    parser.add_argument("--weights", action="store_true", help="measure the weights of the guesses")
     given = parser.parse_args()
+    if given.weights:
+        weights.measure(max(given.count, 400))
+        return 0
     found: dict[str, list[str]] = defaultdict(list)
     for k in range(given.count) if given.show is None else [given.show]:
         with tempfile.TemporaryDirectory() as folder:

@@ -55,7 +55,8 @@ def write(made: Drawn, folder: Path, rng: np.random.Generator) -> list[Path]:
         holds = {"ans" if rng.random() < 0.5 else "Log": both}
         _forget(made)
     elif layout == "mat, structure with time":
-        signals = np.array([{"values": c.values[:, None], "label": n} for c, n in zip(made.columns[1:], names[1:])])
+        signals = np.array([(c.values[:, None], n) for c, n in zip(made.columns[1:], names[1:])],
+                           dtype=[("values", object), ("label", object)])
         holds = {"ScopeData": {"time": made.columns[0].values[:, None], "signals": signals, "blockName": "rig/Scope"}}
     elif layout == "mat, timeseries":
         holds = {n: {"Time": made.columns[0].values[:, None], "Data": c.values[:, None], "Name": n}

@@ -154,7 +154,7 @@ def _name(rng: np.random.Generator, names: str, role: str) -> str:
 def _clock(rng: np.random.Generator, run: rigs.Run, made: Drawn, names: str) -> Cells | None:
     period = run.t[1]
     kinds = ("s", "ms", "us", "clock", "iso", "unix", "days", "index", "nothing", "wrapped")
-    kind = str(rng.choice(kinds, p=(0.42, 0.24, 0.08, 0.06, 0.03, 0.05, 0.02, 0.03, 0.02, 0.05)))
+    kind = str(rng.choice(kinds, p=(0.43, 0.25, 0.08, 0.06, 0.03, 0.05, 0.02, 0.02, 0.01, 0.05)))
     if names == "maker" and rng.random() < 0.7:
         kind = "ms"
     if kind == "wrapped" and run.t[-1] < 20.0:
@@ -204,7 +204,7 @@ def _iso(s: float) -> str:
 
 
 def _angle(rng: np.random.Generator, run: rigs.Run, made: Drawn, names: str) -> tuple[Cells, float]:
-    kind = str(rng.choice(["deg", "rad", "counts"], p=[0.55, 0.37, 0.08]))
+    kind = str(rng.choice(["deg", "rad", "counts"], p=[0.57, 0.4, 0.03]))
     name = _name(rng, names, "y")
     if name in ("deg", "roll", "ang"):
         kind = "deg"
@@ -213,6 +213,8 @@ def _angle(rng: np.random.Generator, run: rigs.Run, made: Drawn, names: str) -> 
     turn = float(rng.choice([1024, 2000, 2400, 4096]))
     size = {"deg": math.radians(1.0), "rad": 1.0, "counts": 2.0 * math.pi / turn}[kind]
     lsb, digits = STEPS[kind][int(rng.integers(len(STEPS[kind])))]
+    if lsb == 1.0 and rng.random() < 0.5:
+        lsb, digits = STEPS[kind][0]  # whole degrees are rarer than the others
     zero = float(rng.choice([0.0, 0.0, 0.0, -math.radians(83.0), math.pi, 0.4]))
     sign = float(rng.choice([1.0, 1.0, 1.0, -1.0]))
     x = (sign * run.theta + zero) / size
@@ -228,12 +230,13 @@ def _angle(rng: np.random.Generator, run: rigs.Run, made: Drawn, names: str) -> 
 
 
 def _command(rng: np.random.Generator, run: rigs.Run, made: Drawn, names: str) -> Cells | None:
-    if run.kind == "free":
-        made.habits["command"] = "none"
+    if run.kind == "free" or (run.kind == "loop" and rng.random() < 0.06):
+        made.habits["command"] = "none" if run.kind == "free" else "not written down"
         return None
+    both = rng.random() < 0.03
     name = _name(rng, names, "u")
     kind = str(rng.choice(["%", "1", "255", "1023", "4095", "1000", "us", "V"],
-                          p=[0.24, 0.28, 0.24, 0.05, 0.05, 0.03, 0.05, 0.06]))
+                          p=[0.28, 0.3, 0.27, 0.02, 0.02, 0.02, 0.06, 0.03]))
     if name in ("E_PITCH", "V_p"):
         kind = "V"
     elif name == "esc":
@@ -243,11 +246,14 @@ def _command(rng: np.random.Generator, run: rigs.Run, made: Drawn, names: str) -
     elif name in ("throttle", "duty", "DC", "Tastgrad") and kind not in ("%", "1"):
         kind = "%"
     made.habits["command"] = kind
-    digits = int({"%": rng.choice([0, 1, 2]), "1": rng.choice([2, 3, 4]), "V": 2}.get(kind, 0))
+    digits = int({"%": rng.choice([0, 1, 2], p=[0.2, 0.4, 0.4]), "1": rng.choice([2, 3, 4]), "V": 2}.get(kind, 0))
     supply = float(rng.choice([5.0, 11.1, 12.0, 24.0]))
     low, high, unit = {"%": (0.0, 100.0, "%"), "1": (0.0, 1.0, ""), "us": (1000.0, 2000.0, "us"),
                        "V": (0.0, supply, "V")}.get(kind) or (0.0, float(kind), "")
     x = np.round(low + (high - low) * run.u, digits)
+    if both and kind in ("%", "1", "V"):
+        x[: len(x) // 20] = np.round(-0.3 * high, digits)  # it brakes at first
+        made.truth.asks = made.truth.asks or "the motor is driven both ways"
     if kind == "V":
         made.truth.asks = made.truth.asks or "the supply is in no file"
     made.truth.duty = np.clip((x - low) / (high - low), 0.0, 1.0)
@@ -257,7 +263,8 @@ def _command(rng: np.random.Generator, run: rigs.Run, made: Drawn, names: str) -
 def _extras(rng: np.random.Generator, run: rigs.Run, names: str, y: Cells, size: float, u: Cells | None) -> list[Cells]:
     n, digits = len(run.t), max(y.digits or 0, 2)
     found: list[Cells] = []
-    offset = float(np.mean(y.values - run.theta / size)) if np.corrcoef(y.values, run.theta)[0, 1] > 0.0 else None
+    sign = 1.0 if np.corrcoef(y.values, run.theta)[0, 1] > 0.0 else -1.0
+    offset = float(np.mean(y.values - run.theta / size)) if sign > 0.0 else None
     chosen = [x for x in EXTRAS if rng.random() < (0.6 if x in ("r", "e") else 0.12)]
     noise = rng.standard_normal
     for extra in chosen:
@@ -272,9 +279,9 @@ def _extras(rng: np.random.Generator, run: rigs.Run, names: str, y: Cells, size:
             scale = float(np.ptp(u.values)) / max(float(np.ptp(run.u)), 1e-9) if u else 1.0
             found += [Cells(extra, key, np.round(scale * x, 3), 3) for key, x in run.terms.items()]
         elif extra == "v":
-            found.append(Cells(extra, name, np.round(run.rate / size * (1 + 0.02 * noise(n)), 3), 3))
+            found.append(Cells(extra, name, np.round(sign * run.rate / size * (1 + 0.02 * noise(n)), 3), 3))
         elif extra == "acceleration":
-            found.append(Cells(extra, "acc", np.round(np.gradient(run.rate, run.t) / size, 3), 3))
+            found.append(Cells(extra, "acc", np.round(sign * np.gradient(run.rate, run.t) / size, 3), 3))
         elif extra == "b":
             found.append(Cells(extra, name, np.round(11.8 - 0.4 * run.w + 0.02 * noise(n), 2), 2, "V"))
         elif extra == "n":
