@@ -6,7 +6,9 @@
     make habits ARGS="--show 12"              what import says about one of them
 
 right: time, angle and command are those of the rig. asked: import does not use what it is not sure of. refused: it
-cannot read the file. wrong: it made a recording that is not that of the rig. Seeds below 1000 are for development.
+cannot read the file. wrong: it made a recording that is not that of the rig. Of some tables nobody could know all
+without asking (the supply of a command in volts, the counts of a turn): the share of right answers is that of the others.
+Seeds below 1000 are for development.
 """
 
 from __future__ import annotations
@@ -97,15 +99,16 @@ def main() -> int:
         if result != "right":
             print(f"{k}: {result}: {habits}" + (f" ({made.truth.asks})" if made.truth.asks else ""))
         found["all"].append(result)
+        found["to be known" if not made.truth.asks else "not to be known"].append(result)
         for key, value in made.habits.items():
             found[f"{key}: {value}"].append(result)
     print(f"{'':<28}tables  right  asked refused  wrong")
     for habit, results in sorted(found.items(), key=lambda item: (item[0] != "all", item[0])):
         counts = [results.count(result) for result in ("right", "asked", "refused", "wrong")]
         print(f"{habit:<28}{len(results):6d}" + "".join(f"{count:7d}" for count in counts))
-    right = found["all"].count("right") / len(found["all"])
+    right = found["to be known"].count("right") / max(len(found["to be known"]), 1)
     good = 1.0 - (found["all"].count("wrong") + found["all"].count("refused")) / len(found["all"])
-    print(f"right without options: {100.0 * right:.0f} % (at least {100.0 * RIGHT:.0f} %)\n"
+    print(f"right without options, of those to be known: {100.0 * right:.0f} % (at least {100.0 * RIGHT:.0f} %)\n"
           f"right or asked: {100.0 * good:.0f} % ({100.0 * ASKED:.0f} %)")
     return int(right < RIGHT or good < ASKED)
 

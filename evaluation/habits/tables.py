@@ -254,6 +254,8 @@ def _command(rng: np.random.Generator, run: rigs.Run, made: Drawn, names: str) -
     if both and kind in ("%", "1", "V"):
         x[: len(x) // 20] = np.round(-0.3 * high, digits)  # it brakes at first
         made.truth.asks = made.truth.asks or "the motor is driven both ways"
+    if kind in ("1000", "1023", "4095") and x.max() < high:
+        made.truth.asks = made.truth.asks or "the counts of full duty are in no file"
     if kind == "V":
         made.truth.asks = made.truth.asks or "the supply is in no file"
     made.truth.duty = np.clip((x - low) / (high - low), 0.0, 1.0)

@@ -26,6 +26,9 @@ SURE = 2.5
 MOST = 14
 """Greatest number of columns whose relations are examined (choice: all pairs are)."""
 
+FILLED = 0.1
+"""Least share of cells with a number, for a column and not notes beside a table (choice: a log of changes has more)."""
+
 MUCH, SOME, LITTLE = 1.0, 0.5, 0.2
 """[nats] Edges of the classes of `gain` (choices)."""
 
@@ -146,9 +149,8 @@ def _nothing(column: Column) -> Guess:
         named = meaning(column.name, column.unit)
         return Guess(named.quantity if named.quantity in ("time", "theta", "duty") else "",
                      why=f"text: {column.complaint.split(': ', 2)[-1]}")
-    if not np.isfinite(column.values).any():
-        return Guess(why="no numbers")
-    return Guess()
+    share = float(np.isfinite(column.values).mean()) if len(column.values) else 0.0
+    return Guess(why="no numbers" if share == 0.0 else "hardly any numbers" if share < FILLED else "")
 
 
 # The clock
@@ -297,7 +299,13 @@ def _arm(table: Table, seen: list[_Seen], found: list[Guess], clock: int | None,
     found[a] = Guess("theta", unit, _reason(seen[a], "theta", scale, doubt), clear and not doubt)
     others = {pair[1]: odds for pair, odds in rivals.items() if pair[0] == a and pair[1] != b}
     if b is None:
+        others = {k: odds for k, odds in others.items() if k is not None and (
+            gains[a, k] >= LITTLE or named[k][1] > 0.0)}
         rival = _rival(both[a, b], others)
+        movers = [k for k in free if k != a and gains[a, k] >= LITTLE and k not in follows and (a, k) not in tracked
+                  and seen[k].meaning.odds < STRONG]
+        if rival is None and movers:
+            rival = max(movers, key=lambda k: both[a, k])
         if rival is None:
             _constant_command(seen, found)
         else:

@@ -125,7 +125,7 @@ def _flat(tree: Mapping[str, Any], prefix: str = "", depth: int = 0) -> Iterator
         elif array.dtype.names and 1 < array.size <= MOST_RECORDS and depth < DEEPEST:
             for k, record in enumerate(array.flat):
                 fields = {key: record[key] for key in array.dtype.names}
-                label = _text(fields.get("label")) or f"{name}({k + 1})"
+                label = _text(fields.pop("label", None)) or f"{name}({k + 1})"
                 yield from _flat(fields, f"{prefix}{label}.", depth + 1)
         elif array.dtype == object and 1 < array.size <= MOST_RECORDS and depth < DEEPEST:
             yield from _flat({f"{name}{{{k + 1}}}": cell for k, cell in enumerate(array.flat)}, prefix, depth + 1)
