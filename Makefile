@@ -19,7 +19,7 @@ ifneq ($(CURDIR)$(PYTHON),$(shell cat .venv/.tree 2>/dev/null))
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test bench blind real sensitivity regression soak coverage lint clean distclean
+.PHONY: help demo test bench blind real habits sensitivity regression soak coverage lint clean distclean
 
 help: ## show this
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile | expand -t 20
@@ -47,6 +47,9 @@ blind: .venv/.dev ## diagnose recordings of withheld effects, then open their la
 
 real: .venv/.dev ## diagnose recordings of real rigs beside a grey box (DATA=folder with rigs.csv, ARGS="--only a b")
 	$(BIN)/python -m evaluation.real $(DATA) $(ARGS)
+
+habits: .venv/.dev ## import tables in the habits of other people (ARGS="--count 200 --seed 1001")
+	$(BIN)/python -m evaluation.habits $(ARGS)
 
 sensitivity: .venv/.dev ## diagnose with each decision threshold at 70 and 130 % (ARGS="--minutes 20"; ARGS=--docs)
 	$(BIN)/python -m evaluation.sensitivity $(ARGS)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from arm_tables import driven
 from evaluation import promises
 from scipy.signal import lfilter
 
@@ -282,11 +283,12 @@ def test_the_equations_that_the_guide_shows_are_those_of_the_simulated_rig():
 @pytest.mark.promise("Tables", "`import` shows the columns of a file and proposes their meaning")
 def test_import_proposes_what_the_guide_shows(tmp_path, monkeypatch, capsys):
     shown = GUIDE["import"].partition(".venv/bin/import messung.csv\n")[2].partition("\n\nSay")[0]
-    angle = np.array([-83.0, -83.0, -82.9, -83.2, 1.4, *[-40.0] * 595])
-    rows = [f"{0.02 * k:.3f};{theta:.1f}".replace(".", ",") + f";{255 * (k > 99)}\n" for k, theta in enumerate(angle)]
-    (tmp_path / "messung.csv").write_text("Zeit [s];Winkel [°];Tastgrad\n" + "".join(rows), encoding="utf-8")
+    pwm = np.repeat([0, 59, 24, 78, 0, 43], 100)
+    theta = driven(pwm) - 83.0
+    rows = [f"{0.02 * k:.3f};{x:.1f}".replace(".", ",") + f";{u}\n" for k, (x, u) in enumerate(zip(theta, pwm))]
+    (tmp_path / "messung.csv").write_text("Zeit [s];Winkel [°];PWM\n" + "".join(rows), encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.setenv("COLUMNS", "200")
     assert import_table.main(["messung.csv"]) == 2
     said = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert [line for line in shown.splitlines() if line.split() not in said] == []

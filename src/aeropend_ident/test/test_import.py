@@ -8,7 +8,22 @@ import shlex
 import numpy as np
 import pytest
 import yaml
-from arm_tables import ANGLE, DUTY, MAPPED, NUMBERS, TIME, comma, imported, lines, put, refused
+from arm_tables import (
+    ANGLE,
+    DRIVEN,
+    DUTY,
+    LONG,
+    MAPPED,
+    NUMBERS,
+    PUSH,
+    TIME,
+    comma,
+    driven,
+    imported,
+    lines,
+    put,
+    refused,
+)
 
 from aeropend_ident.bags.cdr import decode, encode
 from aeropend_ident.bags.recording import read
@@ -34,21 +49,21 @@ def proposed(capsys, path):
     "время,угол,ШИМ", "时间,角度,占空比", "time_s,angle_deg,duty_pct",
 ])  # fmt: skip
 def test_what_is_obvious_is_proposed_and_works_as_it_stands(tmp_path, capsys, head):
-    path = put(tmp_path, head + "\n" + lines(TIME, ANGLE, DUTY))
+    path = put(tmp_path, head + "\n" + lines(LONG, DRIVEN, PUSH))
     command, out = proposed(capsys, path)
     assert "0.0000  0.0200  0.0400" in out
     assert not (tmp_path / "bag").exists()
     command[1] = str(tmp_path / "bag")
     assert main(command) == 0
     recording = read(tmp_path / "bag")
-    np.testing.assert_allclose(recording.theta, np.radians(ANGLE), atol=1e-4)
-    np.testing.assert_allclose(recording.duty, DUTY / 100, atol=1e-7)
+    np.testing.assert_allclose(recording.theta, np.radians(DRIVEN), atol=1e-4)
+    np.testing.assert_allclose(recording.duty, PUSH / 100, atol=1e-7)
     assert main([str(path), str(tmp_path / "same"), "--accept"]) == 0
     np.testing.assert_array_equal(read(tmp_path / "same").theta, recording.theta)
 
 
 def test_a_proposal_for_columns_without_names(tmp_path, capsys):
-    command, _ = proposed(capsys, put(tmp_path, lines(1e3 * TIME + 5000, ANGLE, form="{:.0f}")))
+    command, _ = proposed(capsys, put(tmp_path, lines(1e3 * TIME + 5000, ANGLE, form="{:.1f}")))
     assert command[2:] == ["--time", "1:ms", "--theta", "2:deg"]
     text = "".join(f"12:00:{t:06.3f};{x:.1f}\n" for t, x in zip(TIME, ANGLE))
     assert proposed(capsys, put(tmp_path, text))[0][2:] == ["--time", "1", "--theta", "2:deg"]
@@ -56,16 +71,22 @@ def test_a_proposal_for_columns_without_names(tmp_path, capsys):
 
 @pytest.mark.promise("Tables", "`import` shows the columns of a file and proposes their meaning")
 @pytest.mark.parametrize(("text", "says"), [
-    ("t,angle 1,angle 2\n" + lines(TIME, ANGLE, ANGLE), "perhaps --theta 'angle 2:deg' (one of 2 such columns)"),
-    ("t,angle\n" + lines(TIME, ANGLE / 57.3), "rad or deg?"),
-    ("t,angle,speed\n" + lines(TIME, ANGLE, ANGLE), "perhaps --omega speed:UNIT (its name; rad/s or rpm?)"),
-    ("t,angle,pwm\n" + lines(TIME, ANGLE, 5 * DUTY, form="{:.0f}"), "perhaps --duty pwm:counts:255"),
+    ("t,angle 1,angle 2\n" + lines(TIME, ANGLE, driven(0.0 * TIME + 50.0)), "the name of column 3 says theta too"),
+    ("t,angle\n" + lines(TIME, ANGLE / 15.0), "rad or deg?"),
+    ("t,angle\n" + "".join(f"{t:.2f},{x:.0f}\n" for t, x in zip(TIME, ANGLE)), "deg, or counts of a turn?"),
+    ("t,angle,pwm\n" + "".join(f"{t:.2f},{x:.2f},{u:.0f}\n" for t, x, u in zip(LONG, DRIVEN, PUSH)),
+     "check --duty pwm:counts:255"),
+    ("t,angle,pwm\n" + lines(TIME, ANGLE, DUTY), "but column 2 \"angle\" does not follow it"),
+    ("t,pwm,angle\n" + lines(LONG, DRIVEN, PUSH), "but it does not move as an arm"),
+    ("t,angle,u [V]\n" + lines(LONG, DRIVEN, PUSH / 10), "of which supply? add --supply 12V"),
+    ("t,angle,u\n" + lines(LONG, DRIVEN, np.where(PUSH > 0.0, PUSH, -20.0)), "add --both-ways clip"),
+    ("k,angle,u\n" + lines(np.arange(len(LONG)), DRIVEN, PUSH), "a counter of rows, or ms?"),
 ])  # fmt: skip
 def test_what_is_not_obvious_is_not_accepted(tmp_path, capsys, text, says):
     assert main([str(put(tmp_path, text)), str(tmp_path / "bag"), "--accept"]) == 2
     out, err = capsys.readouterr()
     assert says in out
-    assert "which is not clear" in err
+    assert "check first what is not clear" in err
     assert err.count("\n") == 1
     assert not (tmp_path / "bag").exists()
 

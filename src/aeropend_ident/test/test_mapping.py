@@ -71,6 +71,34 @@ def test_an_encoder_that_passes_the_end_of_its_turn(tmp_path, capsys):
     assert "passes the end of its turn" in capsys.readouterr().out
 
 
+@pytest.mark.promise("Tables", "A command in volts is a share of the supply")
+def test_a_command_in_volts(tmp_path, capsys):
+    path = put(tmp_path, "t,x,u [V]\n" + lines(TIME, ANGLE, DUTY / 100 * 12.0))
+    assert "needs the voltage of the supply" in refused(capsys, path, tmp_path / "bag", *MAPPED, "--duty", "u")
+    for option, supply in (("u", "12V"), ("u:V", "12"), ("u [V]:1000mV", "12000mV")):
+        recording = imported(tmp_path, path, *MAPPED, "--duty", option, "--supply", supply)
+        np.testing.assert_allclose(recording.duty, DUTY / 100, atol=1e-5)
+    assert "--supply 'x': give its voltage" in refused(capsys, path, tmp_path / "bag", *MAPPED, "--duty", "u",
+                                                       "--supply", "x")
+    assert "for a command in volts" in refused(capsys, path, tmp_path / "bag", *MAPPED, "--supply", "12V")
+
+
+@pytest.mark.promise("Tables", "A command that goes both ways is refused, or clipped and counted")
+def test_a_command_that_goes_both_ways(tmp_path, capsys):
+    path = put(tmp_path, "t,x,u\n" + lines(TIME, ANGLE, DUTY - 10.0))
+    assert "--both-ways clip sets 100 rows of 200 to 0" in refused(capsys, path, tmp_path / "bag", *MAPPED, "--duty",
+                                                                   "u:%")
+    recording = imported(tmp_path, path, *MAPPED, "--duty", "u:%", "--both-ways", "clip")
+    np.testing.assert_allclose(recording.duty, np.maximum(DUTY - 10.0, 0.0) / 100, atol=1e-7)
+    assert "duty: 100 rows of 200 below 0, down to -10 %, set to 0 (as you say)" in capsys.readouterr().out
+
+
+def test_days_since_long_ago(tmp_path):
+    path = put(tmp_path, "t,x\n" + "".join(f"{739000.25 + t / 86400.0:.10f},{x:.4f}\n" for t, x in zip(TIME, ANGLE)))
+    recording = imported(tmp_path, path, "--time", "t:day", "--theta", "x:deg")
+    np.testing.assert_allclose(recording.t - recording.t[0], TIME, atol=1e-4)
+
+
 def test_a_motor_that_was_off(tmp_path):
     recording = imported(tmp_path, put(tmp_path, "t,x\n" + NUMBERS), *MAPPED, "--motor-off")
     assert not recording.duty.any()

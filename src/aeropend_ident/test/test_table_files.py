@@ -5,12 +5,27 @@ import datetime
 import io
 import zipfile
 import zlib
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import scipy.io
-from arm_tables import ANGLE, DUTY, MAPPED, TIME, comma, imported, lines, refused, table_rows, workbook
+from arm_tables import (
+    ANGLE,
+    DRIVEN,
+    DUTY,
+    LONG,
+    MAPPED,
+    PUSH,
+    TIME,
+    comma,
+    imported,
+    lines,
+    refused,
+    table_rows,
+    workbook,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -92,6 +107,35 @@ def test_matlab_files(tmp_path, capsys):
         file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
     recording = imported(tmp_path, tmp_path / "new.mat", "--time", "t:s", "--theta", "log.angle:deg")
     np.testing.assert_allclose(recording.theta, np.radians(ANGLE))
+
+
+@pytest.mark.promise("Tables", "`import` reads the layouts of MATLAB and Simulink")
+@pytest.mark.parametrize("layout", ["v4", "To File", "structure with time", "cells", "timeseries"])
+def test_layouts_of_matlab_and_simulink(tmp_path, layout):
+    duty = PUSH / 100.0
+    both = np.stack((LONG, DRIVEN, duty))
+    signals = np.array([(DRIVEN[:, None], "angle"), (duty[:, None], "u")], dtype=[("values", "O"), ("label", "O")])
+    holds = {"v4": {"Log": both}, "To File": {"ans": both}, "timeseries": {
+        "angle": {"Time": LONG[:, None], "Data": DRIVEN[:, None]}, "u": {"Time": LONG[:, None], "Data": duty[:, None]}},
+        "structure with time": {"scope": {"time": LONG[:, None], "signals": signals}},
+        "cells": {"t": LONG, "logs": np.array([DRIVEN, duty, None], dtype=object)[:2]}}[layout]
+    scipy.io.savemat(tmp_path / "run.mat", holds, format="4" if layout == "v4" else "5")
+    recording = imported(tmp_path, tmp_path / "run.mat", "--accept")
+    np.testing.assert_allclose(recording.theta, np.radians(DRIVEN))
+    np.testing.assert_allclose(recording.duty, duty, atol=1e-7)
+
+
+def test_objects_of_matlab_are_named_with_what_to_do(monkeypatch):
+    arrays = {f"rig{files.OPAQUE}": np.zeros(0)}
+    with pytest.raises(TableError, match=r"run.mat: holds a table or timeseries object.*writetable\(T, 'run.csv'\)"):
+        files._of_arrays(Path("run.mat"), arrays)
+    (note,) = files._of_arrays(Path("run.mat"), {**arrays, "t": TIME}).notes
+    assert note.startswith("left out: rig, a table or timeseries object")
+
+
+@pytest.mark.parametrize("start", [b"t,x\n0.0,1.0\n0.1,1.1\n", bytes(40), b"\x00" * 4 + b"abcdefghijklmnopqrstuvwxyz"])
+def test_other_files_are_not_taken_for_matlab_4(start):
+    assert not files.is_matlab_4(start)
 
 
 @pytest.mark.promise("Tables", "`import` reads CSV, text, Excel, MATLAB and NumPy")

@@ -41,6 +41,27 @@ DIALECTS = {
 }
 
 
+def test_each_column_may_have_its_own_decimal_mark(tmp_path):
+    text = "t;x;u\n" + "".join(f"{t:.2f};{x:.3f};1\n".replace(".", ",", 1) for t, x in zip(TIME, ANGLE))
+    table = files.read(put(tmp_path, text))
+    np.testing.assert_allclose(table.columns[0].values, TIME)
+    np.testing.assert_allclose(table.columns[1].values, ANGLE, atol=1e-3)
+    assert table.notes == ("numbers have a decimal comma in column 1, in others a decimal point",)
+
+
+@pytest.mark.parametrize("head", ["t,x,u,spare", "t,x", "# t,x,u,spare"])
+def test_names_of_another_number_than_the_columns_are_not_used(tmp_path, head):
+    table = files.read(put(tmp_path, head + "\n" + lines(TIME, ANGLE, ANGLE)))
+    assert [column.name for column in table.columns] == ["", "", ""]
+    assert "which belongs to which is not clear" in "".join(table.notes) or head.startswith("#")
+
+
+def test_cells_beside_a_table_need_no_names(tmp_path):
+    text = "t,x,u,,,\n0,1,2,,,\n1,2,3,,0.5,mean\n2,3,4,,,\n" + "".join(f"{k},2,3,,,\n" for k in range(3, 50))
+    table = files.read(put(tmp_path, text))
+    assert [column.name for column in table.columns][:3] == ["t", "x", "u"]
+
+
 @pytest.mark.promise("Tables", "`import` reads CSV, text, Excel, MATLAB and NumPy")
 @pytest.mark.parametrize("name", DIALECTS)
 def test_dialects(tmp_path, name):

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Convert a table to a recording: `import run.csv my_bag --time t:ms --theta angle:deg --duty pwm:%`.
 
-Without options for the columns, the command shows the table and proposes options. --accept uses the proposal.
+Without options for the columns, the command shows the table and proposes options, by names, units and numbers. --accept
+uses the proposal if it is sure.
 Exit code 0: a recording is written; 2: the table cannot be used, with one line on standard error.
 """
 
@@ -23,8 +24,10 @@ from rich.table import Table as Shown
 
 from aeropend_ident.tables import files
 from aeropend_ident.tables.clock import CLOCKS
-from aeropend_ident.tables.guess import Guess, guess, is_obvious, option, options
+from aeropend_ident.tables.guess import Given, Guess, guess, is_obvious, option, options
+from aeropend_ident.tables.join import join
 from aeropend_ident.tables.mapping import Plan, Samples, no_time, samples
+from aeropend_ident.tables.sparkline import sparkline
 from aeropend_ident.tables.table import Table, TableError
 from aeropend_ident.tables.units import UNITS, listed
 from aeropend_ident.tables.write import BagExistsError, write
@@ -43,6 +46,8 @@ examples:
   import fall.csv my_bag --time 1:s --theta 2:deg --zero end --motor-off
   import day1.xlsx day2.xlsx bags --sheet Data --time 1:s --theta 2:deg --duty 3:%
   import adc.npy my_bag --rate 490 --theta 1:counts:1024 --zero 512 --flip
+  import rig.csv my_bag --time t:s --theta y:rad --duty u:V --supply 12V --both-ways clip
+  import angle.csv my_bag --with voltage.csv --accept --supply 12V
 
 COLUMN is the name of a column in the file, or its number, from 1. A unit may have a factor: `--theta pot:54deg` if one
 volt is 54 degrees, `--current adc:-4.9mA`. With several files, each becomes a recording in the folder given last.
@@ -75,6 +80,14 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
                            "if it hangs at rest at the start or the end; default 0")
     more.add_argument("--flip", action="store_true", help="--theta decreases when the arm is lifted")
     more.add_argument("--motor-off", action="store_true", help="the duty was always 0, as in a free swing")
+    more.add_argument("--supply", metavar="VOLTAGE",
+                      help="voltage of the supply, as in 12V: full duty, for a command in volts (--duty COLUMN:V)")
+    more.add_argument("--both-ways", choices=("clip",), default="",
+                      help="clip: set a command that reverses or brakes the motor to 0 there, and count the rows; "
+                           "without it such a command is refused")
+    more.add_argument("--with", action="append", default=[], metavar="FILE", dest="others",
+                      help="another file of the same experiment, joined by its time: each row takes the last value "
+                           "before it; may be repeated")
     more.add_argument("--clock", choices=CLOCKS, default="auto",
                       help="even: the rows are evenly spaced and the stamps are not exact; stamps: every stamp is "
                            "right; auto: choose by the data and report why")
@@ -101,6 +114,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     named = [quantity for quantity in UNITS if getattr(given, quantity)]
     if given.accept and named:
         parser.error(f"--accept and --{named[0]} contradict each other: give one")
+    if given.others and len(given.files) > 1:
+        parser.error("--with belongs to one file: import the others one by one")
     return given
 
 
@@ -125,7 +140,8 @@ def _delimiter(text: str) -> str:
 def plan_of(given: argparse.Namespace) -> Plan:
     """The options of the command line as a plan for the columns."""
     return Plan(**{quantity: getattr(given, quantity) for quantity in UNITS}, rate=given.rate, zero=given.zero,
-                flip=given.flip, motor_off=given.motor_off, clock=given.clock, skip_bad=given.skip_bad)
+                flip=given.flip, motor_off=given.motor_off, clock=given.clock, skip_bad=given.skip_bad,
+                supply=given.supply, both_ways=given.both_ways)
 
 
 def run(given: argparse.Namespace, arguments: Sequence[str]) -> int:
@@ -149,15 +165,17 @@ def run(given: argparse.Namespace, arguments: Sequence[str]) -> int:
     for done, (file, bag) in enumerate(zip(given.files, bags)):
         try:
             with progress(f"reading {printable(file.name)}") as show:
-                table = files.read(file, sheet=given.sheet, delimiter=given.delimiter, decimal=given.decimal)
-                now = plan
+                table = _read(file, given)
+                now, unsure = plan, ""
                 if not plan.columns():
-                    found = guess(table)
+                    found = guess(table, Given(plan.supply is not None, plan.both_ways == "clip"))
                     chosen = options(table, found)
                     if plan.rate is not None:
                         chosen.pop("time", None)
                     if not given.accept or not _enough(chosen, found, plan):
                         return propose(table, found, chosen, given, arguments)
+                    unsure = "".join(f"  perhaps --{one.quantity} {shlex.quote(option(table, k, one))} ({one.why})\n"
+                                     for k, one in enumerate(found) if one.quantity and not one.sure)
                     now = replace(plan, **cast("dict[str, Any]", chosen))
                 taken = samples(table, now)
                 assert bag is not None
@@ -169,12 +187,23 @@ def run(given: argparse.Namespace, arguments: Sequence[str]) -> int:
         except OSError as error:
             raise TableError(f"{bag}: cannot be written: {error.strerror or error}") from None
         tell(bag, file, taken)
+        print(printable(unsure.rstrip()), end="\n" if unsure else "")
     return 0
+
+
+def _read(file: Path, given: argparse.Namespace) -> Table:
+    """The table of a file, and of those that belong to it."""
+    first, *others = [files.read(path, sheet=given.sheet, delimiter=given.delimiter, decimal=given.decimal)
+                      for path in (file, *map(Path, given.others))]
+    return join([first, *others]) if others else first
 
 
 def _enough(chosen: dict[str, str], found: Sequence[Guess], plan: Plan) -> bool:
     if plan.rate is not None:
-        return "theta" in chosen and not any(one.quantity not in ("", "time") and not one.sure for one in found)
+        chosen = {**chosen, "time": ""}
+        found = [one for one in found if one.quantity != "time"]
+    if plan.motor_off and "duty" in chosen:
+        return False
     return is_obvious(chosen, list(found))
 
 
@@ -225,42 +254,64 @@ def propose(table: Table, found: Sequence[Guess], chosen: dict[str, str], given:
     if not console.is_terminal:
         console = Console(highlight=False, width=10_000)
     shown = Shown(box=box.SIMPLE_HEAD, pad_edge=False)
-    for heading in ("column", "first values", "range", "looks like"):
+    encoding = getattr(sys.stdout, "encoding", None)
+    for heading in ("column", "first values", "range", "", "looks like"):
         shown.add_column(heading, overflow="fold")
     for k, (column, one) in enumerate(zip(table.columns, found)):
         x = column.values[np.isfinite(column.values)]
         low_high = f"{x.min():.6g} to {x.max():.6g}" if len(x) and not column.is_clock else ""
         what = f"{one.quantity}{'' if one.sure else '?'} ({one.why})" if one.quantity else one.why or "?"
-        cells = (table.label(k), "  ".join(column.shown), low_high, what)
+        cells = (table.label(k), "  ".join(column.shown), low_high, sparkline(column.values, encoding), what)
         shown.add_row(*(escape(printable(cell)) for cell in cells))
     print(printable(f"{table.path}: {counted(len(table), 'row')}"))
     for note in table.notes:
         print(f"  {printable(note)}")
     console.print(shown)
-    if "time" not in chosen and given.rate is None and not any(one.quantity == "time" for one in found):
+    timeless = given.rate is None and not any(one.quantity == "time" for one in found)
+    if timeless and not any(one.quantity == "theta" for one in found):
         print(f"import: {one_line(no_time(table))}", file=sys.stderr)
         return 2
     bag = given.bag or Path(table.path.stem)
-    kept = [word for word in arguments if word not in ("--accept", *given.paths)]
+    kept = _kept(arguments, given)
+    open_ = {one.quantity: option(table, k, one) for k, one in enumerate(found)
+             if one.quantity in ("time", "theta", "duty") and not one.sure}
+    if given.rate is not None:
+        open_.pop("time", None)
+    all_ = {**chosen, **open_}
     words = ["import", str(table.path), str(bag)]
     for quantity in UNITS:
-        if quantity in chosen:
-            words += [f"--{quantity}", chosen[quantity]]
-    missing = [f"--{quantity} COLUMN:UNIT" for quantity in ("time", "theta")
-               if quantity not in chosen and not (quantity == "time" and given.rate is not None)]
+        if quantity in all_:
+            words += [f"--{quantity}", all_[quantity]]
+    missing = ["--rate HZ"] * timeless + ["--theta COLUMN:UNIT"] * ("theta" not in all_)
     print("\n  " + printable(" ".join([shlex.join(words + kept), *missing])))
     for k, one in enumerate(found):
-        if one.quantity and not one.sure:
-            print(printable(f"  perhaps --{one.quantity} {shlex.quote(option(table, k, one))} ({one.why})"))
-    off = "." if "duty" in chosen or given.motor_off else ",\n--motor-off if the motor was always off."
+        if one.quantity and not one.sure and not (one.quantity == "time" and given.rate is not None):
+            check = "check" if one.quantity in open_ else "perhaps"
+            print(printable(f"  {check} --{one.quantity} {shlex.quote(option(table, k, one))} ({one.why})"))
+    off = "." if "duty" in all_ or given.motor_off else ",\n--motor-off if the motor was always off."
     print("\nAdd --zero READING if --theta is not 0 when the arm hangs, --flip if it decreases when the arm is "
           f"lifted{off}")
-    if _enough(chosen, found, plan_of(given)):
+    if timeless:
+        print(f"import: {one_line(no_time(table))}", file=sys.stderr)
+    elif _enough(chosen, found, plan_of(given)):
         print("import: nothing imported yet: give the options of the columns as above, or use them with --accept",
               file=sys.stderr)
     else:
-        print("import: nothing imported: give the meaning of the columns, which is not clear", file=sys.stderr)
+        print("import: nothing imported: give the options of the columns as above, but check first what is not clear",
+              file=sys.stderr)
     return 2
+
+
+def _kept(arguments: Sequence[str], given: argparse.Namespace) -> list[str]:
+    """The words of the command line that stay in the proposed one."""
+    paths = list(given.paths)
+    kept: list[str] = []
+    for k, word in enumerate(arguments):
+        if word in paths and (not k or arguments[k - 1] != "--with"):
+            paths.remove(word)
+        elif word != "--accept":
+            kept.append(word)
+    return kept
 
 
 @entry_point("import")

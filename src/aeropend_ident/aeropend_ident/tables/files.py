@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import json
 import math
+import struct
 import subprocess
 import sys
 import warnings
@@ -39,6 +40,12 @@ MOST_UNPACKED = 1 << 29
 
 MOST_TEXT = 1 << 26
 """Bytes of a workbook's texts and styles, which are held in memory."""
+
+OPAQUE = "<object>"
+"""End of the name of a variable that is an object of MATLAB."""
+
+OPAQUE_SAYS = ("a table or timeseries object, which only MATLAB can read: save its columns there, as in "
+               "writetable(T, 'run.csv') or t = ts.Time; x = ts.Data; save('run.mat', 't', 'x', '-v7')")
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
 
@@ -105,9 +112,26 @@ def _kind(path: Path) -> str:
         raise TableError(f"{path}: is compressed: unpack it first")
     if start.startswith(b"\x89MCAP"):
         raise TableError(f"{path}: is a recording already")
-    if start.startswith((HDF5, b"MATLAB ")) or start[124:128] in (b"\x00\x01IM", b"\x01\x00MI"):
+    if start.startswith((HDF5, b"MATLAB ")) or start[124:128] in (b"\x00\x01IM", b"\x01\x00MI") or is_matlab_4(start):
         return "mat"
     return "text"
+
+
+def is_matlab_4(start: bytes) -> bool:
+    """Whether a file begins as one of MATLAB 4 does: it has no mark, but a header of a matrix with its name.
+
+    Source: MAT-File Format, The MathWorks: type (MOPT), rows, columns, whether complex, length of the name.
+    """
+    for order in ("<", ">"):
+        if len(start) >= 21:
+            kind, rows, columns, imaginary, name = struct.unpack(f"{order}5i", start[:20])
+            # in MOPT, M is the order of bytes, O is 0, P the type of the numbers, T full, text or sparse
+            fits = kind // 1000 == (order == ">") and kind // 100 % 10 == 0 and kind // 10 % 10 <= 5 and kind % 10 <= 2
+            text = start[20 : 20 + max(name - 1, 0)]
+            if fits and kind >= 0 and rows > 0 and columns > 0 and imaginary in (0, 1) and 2 <= name <= 64 and (
+                    text.isascii() and text.replace(b"_", b"a").isalnum()):
+                return True
+    return False
 
 
 # Excel
@@ -322,11 +346,15 @@ def _of_arrays(path: Path, arrays: Arrays) -> Table:
             columns += [(f"{name}.{key}".lstrip("."), array[key]) for key in array.dtype.names if array[key].ndim == 1]
         elif array.dtype.kind in "biuf" and array.size > 1 and np.squeeze(array).ndim <= 2:
             columns += _columns(path, name, array)
+        elif name.endswith(OPAQUE):
+            notes.append(f"left out: {name.removesuffix(OPAQUE) or 'a variable'}, {OPAQUE_SAYS}")
         elif array.dtype.kind == "M" and array.ndim == 1:
             columns.append((name, array))
         else:
             notes.append(f"left out: {name or 'the array'}, which is no series of numbers")
     plain = [(name, values) for name, values in columns if values.dtype.kind in "biufM"]
+    if not plain and any(name.endswith(OPAQUE) for name in arrays):
+        raise TableError(f"{path}: holds {OPAQUE_SAYS}")
     if not plain:
         raise TableError(f"{path}: no series of numbers is found in it")
     lengths = [len(values) for _, values in plain]
@@ -359,4 +387,5 @@ def _series(name: str, values: NDArray[Any]) -> Column:
     numbers = values.astype(np.float64)
     numbers[~np.isfinite(numbers)] = np.nan
     first = numbers[np.isfinite(numbers)][:SHOWN]
-    return Column(name, numbers, split_name(name)[1], shown=tuple(f"{value:.10g}" for value in first))
+    unit = "" if name.endswith("]") else split_name(name)[1]  # what is in brackets is the number in a matrix
+    return Column(name, numbers, unit, shown=tuple(f"{value:.10g}" for value in first))

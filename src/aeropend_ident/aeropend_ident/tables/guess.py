@@ -1,45 +1,62 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Guesses of the meaning of the columns, by their names in many languages, their units and their numbers.
+"""Guesses of the meaning of the columns, from their names, their units and their numbers.
 
-A guess is a proposal to the user. It is used only if the user asks for it.
+The evidence is added up as log odds (naive Bayes): what a name says, and what the numbers say. Angle and command are
+looked for together, because the angle follows the command. A guess is sure if the next best one is far behind and name
+and numbers do not contradict each other. Only what is sure is used without asking.
 """
 
 from __future__ import annotations
 
-import re
-import unicodedata
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from aeropend_ident.tables import scales
+from aeropend_ident.tables.names import STRONG, WEAK, Meaning, meaning, words
 from aeropend_ident.tables.table import Column, Floats, Table
-from aeropend_ident.tables.units import CLOCK, UNITS, known, split_name
+from aeropend_ident.tables.traits import Origin, Traits, differences, gain, is_error, origins, tracks, traits
+from aeropend_ident.tables.units import CLOCK, RPM, UNITS, known
 
-WORDS: dict[str, str] = {
-    "reference": "reference ref setpoint sp soll sollwert sollwinkel target consigna consigne consegna desired "
-                 "referencia riferimento borve zadana уставка задание 目标 设定",
-    "time": "t time zeit zeitpunkt zeitstempel uhrzeit tiempo temps tempo tid tijd czas cas aika ido vreme zaman "
-            "timestamp stamp millis micros hora heure seconds sec sekunden segundos secondes время 时间 時間 시간",
-    "theta": "theta th θ ϑ angle ang angulo angolo winkel vinkel hoek kat uhel kut aci pitch position pos posicion "
-             "posizione lage phi φ alpha α arm arma pendel pendulo pendulum угол 角度 각도",
-    "duty": "duty pwm throttle tastgrad tastverhaltnis stellgrosse stellgroesse ciclo gas gaz control cmd command "
-            "comando commande kommando esc stellwert steuer скважность шим 占空比",
-    "omega": "omega ω w rpm drehzahl rotor velocidad vitesse velocita giri umdrehungen otacky hastighet varvtal "
-             "toerental obroty speed обороты скорость 转速 回転数",
-    "current": "current i strom motorstrom corriente courant corrente stroom prad proud amp amps strøm ток 电流 電流 "
-               "전류",
-    "voltage": "voltage v spannung motorspannung voltaje tension tensione tensao spanning spenning napiecie napeti "
-               "volt напряжение 电压 電圧 전압",
-}
-"""Quantity -> words for it, in lower case without accents. The first quantity with a word in the name counts."""
+SURE = 2.5
+"""[nats] Least distance of a sure guess from the next (choice: 12 to 1)."""
 
-OF_UNIT = ("time", "theta", "omega", "current", "voltage", "duty")
-"""Quantities that can be identified by the unit alone, in order of preference if several have the unit."""
+MOST = 14
+"""Greatest number of columns whose relations are examined (choice: all pairs are)."""
 
-FEWEST = 20
-"""Least number of rows for a rising column without a name to be the time (choice)."""
+FILLED = 0.1
+"""Least share of cells with a number, for a column and not notes beside a table (choice: a log of changes has more)."""
 
-_SPLIT = re.compile(r"[^\w°]+|_|(?<=[a-zäöüа-я])(?=\d)|(?<=[a-z])(?=[A-Z])")
+MUCH, SOME, LITTLE = 1.0, 0.5, 0.2
+"""[nats] Edges of the classes of `gain` (choices)."""
+
+BACK = 0.8
+"""Least ratio of the gains backward and forward for a column that rather follows the angle (choice)."""
+
+ANGLE = {"jumps and holds": -4.7, "noisy": -2.3, "rough": -0.4, "smooth": 0.9}
+COMMAND = {"jumps and holds": 1.4, "noisy": -1.5, "rough": -0.1, "smooth": -0.4}
+PAIR = {"much": 0.7, "much back": -0.9, "some": 0.0, "some back": -1.4, "little": -1.4, "little back": -2.2,
+        "none": -3.3, "none back": -3.1}
+CHAIN = {"followed": -2.2, "last": 0.8}
+"""[nats] Log odds of what is seen in the angle, in the command, in both, and in the chain of columns that predict each
+other, of which the angle is the last (measured: `make habits ARGS=--weights`)."""
+
+AGAINST = -3.5
+"""[nats] Log odds of the numbers below which they contradict the name (choice: 33 to 1)."""
+
+FOLLOWS = -4.0
+"""[nats] Log odds of a column that is computed from another one (choice: 50 to 1)."""
+
+MOVED = -3.0
+"""[nats] Log odds of no command where a column predicts the angle and does not follow from it (measured with free
+swings: fewer than one column in 100)."""
+
+COMMANDED = math.log(0.85 / 0.15)
+"""[nats] Log odds that a table holds a command (choice: most arms are driven)."""
+
+SAID = {"jumps and holds": "it jumps and holds", "noisy": "it is noisy", "rough": "", "smooth": "it moves smoothly"}
 
 
 @dataclass(frozen=True)
@@ -59,35 +76,457 @@ class Guess:
     sure: bool = False
 
 
-def guess(table: Table) -> list[Guess]:
-    """A guess for each column of a table."""
-    found = [_of_column(column) for column in table.columns]
-    if not any(one.quantity == "time" for one in found):
-        found = _unnamed_time(table, found)
-    nameless = [k for k, one in enumerate(found) if not one.quantity and not table.columns[k].is_text]
-    if not any(one.quantity == "theta" for one in found) and any(one.quantity == "time" for one in found) and len(
-            nameless) == 1 and not any(column.name for column in table.columns):
-        k = nameless[0]
-        unit, why, sure_ = _unit_of_angle(table.columns[k].values)
-        found[k] = Guess("theta", unit, f"the only other column; {why}", sure_)
-    for quantity in UNITS:
-        same = [k for k, one in enumerate(found) if one.quantity == quantity]
-        sure = [k for k in same if found[k].sure] or same
-        if quantity == "time" and _agree(table, found, sure):
-            sure = sure[:1]
-        for k in same:
-            if k not in sure:
-                found[k] = Guess(why=f"{quantity}? Column {table.label(sure[0])} rather")
-            elif len(sure) > 1:
-                found[k] = Guess(quantity, found[k].unit, f"one of {len(sure)} such columns")
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """All that is known about a column."""
+
+    column: Column
+    meaning: Meaning
+    traits: Traits
+    words: tuple[str, ...]
+    counts: bool
+    """Whether the numbers may be counts: they are whole, and not written with decimals."""
+
+
+@dataclass(frozen=True)
+class Given:
+    """What the user says that no file contains.
+
+    Attributes:
+        supply: the voltage of the supply, so that a command in volts can be used.
+        clip: what to do with a command that goes both ways.
+    """
+
+    supply: bool = False
+    clip: bool = False
+
+
+def guess(table: Table, given: Given | None = None) -> list[Guess]:
+    """A guess for each column of a table.
+
+    Args:
+        table: the table.
+        given: what the user says.
+    """
+    given = given or Given()
+    seen = _seen(table)
+    found = [_nothing(one.column) for one in seen]
+    clock = _clock(table, seen, found)
+    _arm(table, seen, found, clock, given)
+    for k, one in enumerate(seen):
+        if not found[k].quantity and not found[k].why:
+            found[k] = _rest(one, seen, found)
     return found
 
 
-def _agree(table: Table, found: list[Guess], columns: list[int]) -> bool:
-    """Whether columns of time are equal in different units."""
-    sizes = [UNITS["time"].get(found[k].unit or table.columns[k].unit or CLOCK, 0.0) for k in columns]
-    times = [size * table.columns[k].values for k, size in zip(columns, sizes)]
-    return len(columns) > 1 and all(bool(np.isclose(one, times[0], atol=1e-6, equal_nan=True).all()) for one in times)
+def _seen(table: Table) -> list[_Seen]:
+    out = []
+    for k, column in enumerate(table.columns):
+        x = column.values[np.isfinite(column.values)]
+        decimals = table.lengths is not None and any("." in cell or "," in cell for cell in column.shown)
+        out.append(_Seen(column, _meaning(table, k), traits(column.values), tuple(words(column.name)),
+                         not decimals and bool((x == np.rint(x)).all())))
+    return out
+
+
+def _meaning(table: Table, k: int) -> Meaning:
+    """What the name of a column means; that of a matrix does not tell which of its columns is which."""
+    name, columns = table.columns[k].name, [column.name for column in table.columns]
+    series = name.rstrip("0123456789")
+    if series != name and sum(other.rstrip("0123456789") == series != other for other in columns) > 2:
+        return Meaning()  # x1, x2, x3
+    stem = name.rpartition("[")[0]
+    same = [other for other in columns if stem and other.rpartition("[")[0] == stem and other.endswith("]")]
+    if name.endswith("]") and same[2:]:
+        return Meaning()
+    if name.endswith("]") and same[1:] and name == same[0]:
+        return Meaning()  # the time, where there are two
+    return meaning(name, table.columns[k].unit)
+
+
+def _nothing(column: Column) -> Guess:
+    if column.is_text:
+        named = meaning(column.name, column.unit)
+        return Guess(named.quantity if named.quantity in ("time", "theta", "duty") else "",
+                     why=f"text: {column.complaint.split(': ', 2)[-1]}")
+    share = float(np.isfinite(column.values).mean()) if len(column.values) else 0.0
+    return Guess(why="no numbers" if share == 0.0 else "hardly any numbers" if share < FILLED else "")
+
+
+# The clock
+
+
+def time_of(table: Table) -> tuple[int, float | None] | None:
+    """The column of the time, and the size of its unit [s], None if that is not clear; None without a time."""
+    seen = _seen(table)
+    found = [_nothing(column) for column in table.columns]
+    k = _clock(table, seen, found)
+    if k is None:
+        return None
+    column = table.columns[k]
+    unit = CLOCK if column.is_clock else found[k].unit or _unit(column, "time")
+    return k, UNITS["time"][unit] if unit and found[k].sure else None
+
+
+def _clock(table: Table, seen: list[_Seen], found: list[Guess]) -> int | None:
+    """Find the time; returns its column."""
+    odds = {k: _clock_odds(one) for k, one in enumerate(seen) if not found[k].why}
+    best = max(odds, key=lambda k: (odds[k], len(np.unique(table.columns[k].values)), -k), default=None)
+    if best is None or odds[best] < WEAK:
+        return None
+    one = seen[best]
+    others = [k for k in odds if k != best and odds[k] >= WEAK]
+    unit, why, sure = ("", "times of day", True) if one.column.is_clock else scales.of_time(
+        one.column.values, _unit(one.column, "time"), list(one.words))
+    if one.meaning.quantity == "time":
+        why = f"its name, {why}" if why.startswith("in ") else f"its name; {why}"
+    elif not one.column.is_clock:
+        why = f"it rises evenly, {why}"
+    if sure and not one.column.is_clock and not one.traits.ramp:
+        why, sure = f"{why}; but it does not rise evenly", _rises(one.column.values)
+        why = why if not sure else why.split(";")[0]
+    for k in others:
+        if _agree(one.column, unit, seen[k].column):
+            found[k] = Guess(why=f"time too, as column {table.label(best)}")
+        elif odds[k] > odds[best] - SURE:
+            why, sure = f"{why}; or column {table.label(k)}?", False
+    found[best] = Guess("time", unit, why, sure)
+    for k, other in enumerate(seen):
+        if k != best and not found[k].why and other.traits.ramp:
+            found[k] = Guess(why="it rises evenly, as a counter of rows")
+    return best
+
+
+def _clock_odds(one: _Seen) -> float:
+    if one.column.is_clock:
+        return 2.0 * STRONG
+    if one.traits.constant:
+        return -STRONG
+    odds = STRONG if one.traits.ramp else 0.0 if _rises(one.column.values) else -2.0 * STRONG
+    if one.meaning.quantity == "time":
+        odds += one.meaning.odds
+    elif one.meaning.quantity == "index":
+        odds -= WEAK
+    elif one.meaning.quantity:
+        odds -= one.meaning.odds
+    if one.column.unit:
+        odds += STRONG if known("time", one.column.unit) else -STRONG
+    return odds
+
+
+def _rises(x: Floats) -> bool:
+    """Whether numbers never decrease, but for few restarts."""
+    steps = np.diff(x[np.isfinite(x)])
+    return bool(len(steps) and (steps > 0.0).mean() > 0.02 and (steps < 0.0).mean() <= 0.02)
+
+
+def _agree(one: Column, unit: str, other: Column) -> bool:
+    """Whether two clocks run alike: the one is the other in another unit."""
+    both = np.isfinite(one.values) & np.isfinite(other.values)
+    x, y = one.values[both], other.values[both]
+    if len(x) < 3 or np.ptp(x) == 0.0 or np.ptp(y) == 0.0:
+        return False
+    size = UNITS["time"].get(unit or known("time", one.unit) or CLOCK, 1.0)
+    theirs = UNITS["time"].get(known("time", other.unit) or "", 0.0) or (1.0 if other.is_clock else 0.0)
+    line = np.polyfit(x, y, 1)
+    straight = float(np.std(y - np.polyval(line, x))) <= 1e-3 * float(np.std(y))
+    return straight and (not theirs or abs(line[0] * theirs / size - 1.0) < 0.01)
+
+
+# The arm
+
+
+def about_angle(x: Traits) -> str:
+    """What is seen in a column that may be the angle or the command: a key of `ANGLE` and `COMMAND`."""
+    return "jumps and holds" if x.holds else "noisy" if x.noisy else "rough" if x.rough else "smooth"
+
+
+def about_pair(forth: float, back: float) -> str:
+    """What is seen in an angle and its command: a key of `PAIR`.
+
+    Args:
+        forth: gain of the angle by the command.
+        back: gain of the command by the angle.
+    """
+    how = "much" if forth >= MUCH else "some" if forth >= SOME else "little" if forth >= LITTLE else "none"
+    return how + " back" * (back > BACK * forth)
+
+
+def about_chain(others: list[tuple[float, float]]) -> str:
+    """What is seen in the angle and all other columns: a key of `CHAIN`.
+
+    Args:
+        others: gains of each other column by the angle, and of the angle by it.
+    """
+    return "followed" if any(theirs >= MUCH and own < 0.5 * theirs for theirs, own in others) else "last"
+
+
+def _arm(table: Table, seen: list[_Seen], found: list[Guess], clock: int | None, given: Given) -> None:
+    """Find angle and command together."""
+    free = [k for k, one in enumerate(seen) if not found[k].quantity and not found[k].why and not one.traits.constant]
+    free = sorted(sorted(free, key=lambda k: -abs(seen[k].meaning.odds))[:MOST])
+    every = max(len(table) // 2000, 1)
+    numbers = {k: np.nan_to_num(table.columns[k].values[::every]) for k in free}
+    follows = _explained(table, seen, found, numbers)
+    named = {k: (_named(seen[k], "theta"), _named(seen[k], "duty")) for k in free}
+    angle = {k: ANGLE[about_angle(seen[k].traits)] + follows.get(k, 0.0) for k in free}
+    command = {k: COMMAND[about_angle(seen[k].traits)] + follows.get(k, 0.0) for k in free}
+    gains = {(a, b): gain(seen[a].traits, seen[b].traits) for a in free for b in free if a != b}
+    for k in free:
+        angle[k] += CHAIN[about_chain([(gains[j, k], gains[k, j]) for j in free if j != k and j not in follows])]
+    prior = COMMANDED - math.log(max(len(free) - 1, 1))
+    tracked = {(k, j) for k, j in gains
+               if named[j][1] <= 0.0 and tracks(table.columns[k].values, table.columns[j].values)}
+    both: dict[tuple[int, int | None], float] = {}
+    for k in free:
+        moved = any(gains[k, j] >= SOME and j not in follows and (k, j) not in tracked for j in free if j != k)
+        both[k, None] = angle[k] + named[k][0] + MOVED * moved
+    for k, j in gains:
+        pair = PAIR[about_pair(gains[k, j], gains[j, k])]
+        both[k, j] = angle[k] + named[k][0] + command[j] + named[j][1] + pair + prior + FOLLOWS * ((k, j) in tracked)
+    if not both:
+        return
+    a, b = max(both, key=lambda pair: both[pair])
+    if both[a, b] < 0.0 and clock is None:
+        return
+    same = {k for k in free if found[k].why.startswith("the same as")}
+    rivals = {pair: odds for pair, odds in both.items() if not same & set(pair) - {a, b}}
+    first, second = _contradictions(seen, found, angle, named, a, b)
+    rival = _rival(both[a, b], {pair[0]: odds for pair, odds in sorted(rivals.items(), key=lambda one: one[1])
+                                if pair[0] != a})
+    doubt = first or ("" if rival is None else f"or column {table.label(rival)}?")
+    unit, scale, clear = _angle_scale(seen[a])
+    found[a] = Guess("theta", unit, _reason(seen[a], "theta", scale, doubt), clear and not doubt)
+    others = {pair[1]: odds for pair, odds in rivals.items() if pair[0] == a and pair[1] != b}
+    if b is None:
+        others = {k: odds for k, odds in others.items() if k is not None and (
+            gains[a, k] >= LITTLE or named[k][1] > 0.0)}
+        rival = _rival(both[a, b], others)
+        movers = [k for k in free if k != a and gains[a, k] >= LITTLE and k not in follows and (a, k) not in tracked
+                  and seen[k].meaning.odds < STRONG]
+        if rival is None and movers:
+            rival = max(movers, key=lambda k: both[a, k])
+        if rival is None:
+            _constant_command(seen, found)
+        else:
+            unit, scale, _ = _command_scale(seen[rival], given)
+            found[rival] = Guess("duty", unit, f"perhaps; {scale}", False)
+        return
+    if named[b][1] >= WEAK:  # its owner calls it a command
+        others.pop(None)
+    if gains[a, b] < LITTLE:
+        second = second or f"but column {table.label(a)} does not follow it"
+    rival = _rival(both[a, b], others, none=-1)
+    doubt = second or ("" if rival is None else "or no command?" if rival < 0 else f"or column {table.label(rival)}?")
+    unit, scale, clear = _command_scale(seen[b], given)
+    how = "" if gains[a, b] < SOME else f"column {table.label(a)} follows it"
+    found[b] = Guess("duty", unit, _reason(seen[b], "duty", how, scale, doubt), clear and not doubt)
+
+
+def _rival(best: float, others: dict[Any, float], none: int | None = None) -> int | None:
+    """The column that may be meant as well; `none` stands for no column."""
+    if not others:
+        return None
+    k = max(others, key=lambda key: others[key])
+    return (none if k is None else k) if others[k] > best - SURE else None
+
+
+def _explained(table: Table, seen: list[_Seen], found: list[Guess], numbers: dict[int, Floats]) -> dict[int, float]:
+    """Recognise columns that are computed from others; returns log odds."""
+    odds: dict[int, float] = {}
+    errors = set()
+    for trio in differences(numbers):
+        k = _error_of(seen, numbers, trio)
+        i, j = (one for one in trio if one != k)
+        found[k] = Guess(why=f"the difference of columns {table.label(i)} and {table.label(j)}")
+        odds[k] = FOLLOWS
+        errors.add(k)
+        odds |= {one: FOLLOWS for one in (i, j) if seen[one].traits.holds or (  # the reference, then
+            seen[one].meaning.quantity == "reference")}
+    hidden = [k for k in numbers if k not in errors and any(
+        is_error(table.columns[k].values, table.columns[j].values) and _named(seen[k], "theta") <= 0.0
+        and not seen[k].traits.holds and (_named(seen[j], "theta") > 0.0 or (len(numbers) == 2 and k > j))
+        for j in numbers if j != k)]
+    for k in hidden:
+        found[k] = Guess(why="what is missing to a reference that jumps and holds")
+        odds[k] = FOLLOWS
+    rest = [k for k in numbers if k not in errors and k not in hidden]
+    said = {"same": "the same as", "filtered": "a filtered copy of", "noisy": "a noisy copy of",
+            "derivative": "a derivative of"}
+    for k, origin in _ordered(seen, origins([one.traits for one in seen], rest)).items():
+        if origin.how in said:
+            found[k] = Guess(why=f"{said[origin.how]} column {table.label(origin.of)}")
+            odds[k] = FOLLOWS
+    return odds
+
+
+def _error_of(seen: list[_Seen], numbers: dict[int, Floats], trio: tuple[int, int, int]) -> int:
+    """Which of three columns is the error: by its name, or for it jumps with the reference, and does not hold."""
+    named = [k for k in trio if seen[k].meaning.quantity == "error"]
+    rest = named or [k for k in trio if seen[k].meaning.quantity not in ("theta", "reference", "duty")] or list(trio)
+    moving = [k for k in rest if not seen[k].traits.holds] or rest
+    if len(moving) == len(trio):  # a smooth reference: the error is small
+        return min(moving, key=lambda k: float(np.mean(numbers[k] ** 2)))
+    return max(moving, key=lambda k: float(np.abs(np.diff(numbers[k])).max()))
+
+
+def _ordered(seen: list[_Seen], found: dict[int, Origin]) -> dict[int, Origin]:
+    """Of two columns that follow from each other, that with the clearer name and unit stays."""
+    out = {}
+    for k, origin in found.items():
+        clearer = _clarity(seen[k]) > _clarity(seen[origin.of])
+        named = clearer and seen[origin.of].meaning.quantity not in ("", "theta", "duty")
+        if (origin.how == "same" and clearer) or named:
+            out[origin.of] = Origin(k, origin.how)
+        else:
+            out[k] = origin
+    return out
+
+
+def _clarity(one: _Seen) -> float:
+    return one.meaning.odds * (one.meaning.quantity in ("theta", "duty")) + bool(one.column.unit)
+
+
+def _named(one: _Seen, quantity: str) -> float:
+    """[nats] What name and unit say about a quantity."""
+    odds = 0.0
+    if one.meaning.quantity == quantity:
+        odds = one.meaning.odds
+    elif one.meaning.quantity == "voltage" and quantity == "duty":
+        odds = 0.0
+    elif one.meaning.quantity:
+        odds = -one.meaning.odds
+    unit = one.column.unit
+    if unit and unit not in ("1", "-"):
+        if known(quantity, unit) or (quantity == "theta" and unit.casefold() in ("counts", "ticks", "lsb")):
+            odds += STRONG
+        elif not (quantity == "duty" and (known("voltage", unit) or known("time", unit) == "us"
+                                          or unit.casefold() in ("counts", "ticks", "lsb"))):
+            odds -= STRONG
+    return odds
+
+
+def _contradictions(seen: list[_Seen], found: list[Guess], angle: dict[int, float],
+                    named: dict[int, tuple[float, float]], a: int, b: int | None) -> tuple[str, str]:
+    """Where names and numbers contradict each other, of angle and command; "" if they do not."""
+    first = second = ""
+    if named[a][0] < 0.0 or seen[a].meaning.quantity not in ("", "theta"):
+        first = f"but its name says {seen[a].meaning.quantity or seen[a].column.unit}"
+    elif angle[a] < AGAINST:
+        first = "but it does not move as an arm"
+    else:
+        first = _also(found, {k: odds[0] for k, odds in named.items()}, a, "theta")
+    if b is not None and named[b][1] < 0.0:
+        second = f"but its name says {seen[b].meaning.quantity or seen[b].column.unit}"
+    elif b is not None:
+        second = _also(found, {k: odds[1] for k, odds in named.items()}, b, "duty")
+    return first, second
+
+
+def _also(found: list[Guess], named: dict[int, float], chosen: int, quantity: str) -> str:
+    """Whether another column has the name of a quantity too, and is not computed from others."""
+    for k, odds in named.items():
+        if k != chosen and odds >= STRONG and not found[k].why:
+            return f"but the name of column {k + 1} says {quantity} too" if named[chosen] >= STRONG else (
+                f"but the name of column {k + 1} says {quantity}")
+    return ""
+
+
+def _reason(one: _Seen, quantity: str, *more: str) -> str:
+    name = "its name" if one.meaning.quantity == quantity else ""
+    unit = f"its unit, {one.column.unit}" if not name and known(quantity, one.column.unit) else ""
+    said = SAID[about_angle(one.traits)]
+    if quantity == "theta" and said != SAID["smooth"]:
+        said = ""
+    if quantity == "duty" and not one.traits.holds:
+        said = ""
+    return "; ".join(x for x in (name or unit, said, *more) if x)
+
+
+def _unit(column: Column, quantity: str) -> str:
+    return known(quantity, column.unit) or "" if column.unit else ""
+
+
+def _angle_scale(one: _Seen) -> scales.Scale:
+    said = _unit(one.column, "theta")
+    named = not {"enc", "encoder", "pot", "adc", "potentiometer", "sensor", "raw", "counts"} & set(one.words)
+    unit, why, sure = scales.of_angle(one.column.values, counts=one.counts,
+                                      named=named and one.meaning.quantity == "theta")
+    if said:
+        span = UNITS["theta"][said] * float(np.ptp(one.column.values[np.isfinite(one.column.values)]))
+        possible = 0.01 < span < 4.0 * math.pi
+        return "", f"in {said}" if possible else f"in {said}, {why}?", possible
+    return unit, why, sure
+
+
+def _command_scale(one: _Seen, given: Given) -> scales.Scale:
+    x = one.column.values[np.isfinite(one.column.values)]
+    low, top = float(x.min()), float(x.max())
+    said = _unit(one.column, "duty")
+    if one.meaning.quantity == "voltage" or _unit(one.column, "voltage"):
+        unit, why, sure = "" if _unit(one.column, "voltage") else "V", "in V", given.supply
+        why += "" if sure else f", {low:.4g} to {top:.4g}: of which supply? add --supply 12V"
+    elif said:
+        unit, why, sure = "", f"in {said}", 0.02 < UNITS["duty"][said] * top <= 1.005
+        why += "" if sure else f", {low:.4g} to {top:.4g}?"
+    else:
+        unit, why, sure = scales.of_command(np.abs(x) if low < 0.0 else x, list(one.words), counts=one.counts)
+    if low < 0.0 and -low > 0.005 * top:
+        why += f"; it goes both ways, {low:.4g} to {top:.4g}" + ": add --both-ways clip" * (not given.clip)
+        sure = sure and given.clip
+    return unit, why, sure
+
+
+def _constant_command(seen: list[_Seen], found: list[Guess]) -> None:
+    """A command that never changes, as in a free swing."""
+    for k, one in enumerate(seen):
+        if one.traits.constant and not found[k].why and one.meaning == Meaning("duty", STRONG):
+            zero = not np.nan_to_num(one.column.values).any()
+            found[k] = Guess("duty", "" if _unit(one.column, "duty") else "1", "its name; always 0" if zero else
+                             "its name; it never changes", zero)
+            return
+
+
+# The other columns
+
+
+def _rest(one: _Seen, seen: list[_Seen], found: list[Guess]) -> Guess:
+    """A guess for a column that is neither time nor angle nor command."""
+    if one.traits.constant:
+        return Guess(why="it never changes")
+    quantity, unit = one.meaning.quantity, one.column.unit
+    if quantity not in ("reference", "omega", "current", "voltage") or one.meaning.odds < STRONG:
+        by_unit = next((q for q in ("omega", "current") if unit and known(q, unit)), "")
+        speed = by_unit == "omega" and UNITS["omega"][known("omega", unit) or ""] == RPM
+        if not by_unit or (quantity in ("angle rate", "filtered", "error") and not speed):
+            return Guess(why=f"{quantity}, by its name" if quantity and quantity not in UNITS else "")
+        return Guess(by_unit, "", f"its unit, {unit}", speed or not quantity)
+    if any(other.quantity == quantity for other in found):
+        return Guess(why=f"{quantity}? one is there already")
+    if unit and known(quantity, unit):
+        return Guess(quantity, "", f"its name, in {unit}", sure=True)
+    if quantity == "reference":
+        return _reference(one, seen, found)
+    if quantity == "omega":
+        rpm = bool({"rpm", "drehzahl", "giri", "obroty", "обороты", "转速"} & set(one.words))
+        return Guess(quantity, "rpm" if rpm else "", "its name" if rpm else "its name; rad/s or rpm?", rpm)
+    scale, why, sure = scales.of_electric(quantity, one.column.values)
+    return Guess(quantity, scale, f"its name; {why}", sure)
+
+
+def _reference(one: _Seen, seen: list[_Seen], found: list[Guess]) -> Guess:
+    """A reference has the unit of the angle if it is near it."""
+    for other, its in zip(seen, found):
+        if its.quantity == "theta":
+            x, y = one.column.values, other.column.values
+            near = abs(np.nanmedian(x) - np.nanmedian(y)) <= np.nanmax(y) - np.nanmin(y)
+            unit = its.unit or _unit(other.column, "theta")
+            if near and unit:
+                return Guess("reference", unit, "its name; in the unit of the angle, which it is near", its.sure)
+    return Guess("reference", "", "its name; in which unit?", False)
+
+
+# Options
 
 
 def options(table: Table, found: list[Guess]) -> dict[str, str]:
@@ -114,106 +553,18 @@ def option(table: Table, k: int, one: Guess) -> str:
         name = f"{k + 1}"
     if one.unit:
         return f"{name}:{one.unit}"
-    has_unit = table.columns[k].is_clock or known(one.quantity, table.columns[k].unit)
+    unit = table.columns[k].unit
+    has_unit = table.columns[k].is_clock or known(one.quantity, unit) or (
+        one.quantity == "duty" and known("voltage", unit))
     return name if has_unit else f"{name}:UNIT"
 
 
 def is_obvious(chosen: dict[str, str], found: list[Guess]) -> bool:
-    """Whether time and angle are found and no other guess is uncertain.
+    """Whether time and angle are found, and the command is certain, if there is one.
 
     Args:
         chosen: options by quantity.
         found: a guess for each column.
     """
-    return {"time", "theta"} <= chosen.keys() and not any(one.quantity and not one.sure for one in found)
-
-
-def _words(text: str) -> set[str]:
-    plain = unicodedata.normalize("NFKD", text)
-    plain = "".join(letter for letter in plain if not unicodedata.combining(letter)).replace("ß", "ss")
-    return {word.casefold() for word in _SPLIT.split(plain) if word}
-
-
-def _of_column(column: Column) -> Guess:
-    if column.is_text:
-        return Guess(why=f"text: {column.complaint.split(': ', 2)[-1]}")
-    if not np.isfinite(column.values).any():
-        return Guess(why="no numbers")
-    if column.is_clock:
-        return Guess("time", "", "times of day", sure=True)
-    unit = column.unit
-    words = _words(split_name(column.name)[0] if unit and split_name(column.name)[0] != unit else column.name)
-    named = next((quantity for quantity, known_ in WORDS.items() if words & set(known_.split())), "")
-    by_unit = [quantity for quantity in OF_UNIT if unit and known(quantity, unit)]
-    if named == "reference" and unit and known("reference", unit):
-        return Guess(named, "", f"its name, in {unit}", sure=True)
-    if named in by_unit:
-        return Guess(named, "", f"its name, in {unit}", sure=True)
-    if by_unit and unit not in ("1", "-") and (not named or named != "reference"):
-        # name and unit contradict each other (a speed in degrees): the unit decides, but the guess is not sure
-        return Guess(by_unit[0], "", f"its unit, {unit}", sure=not named)
-    if not named:
-        return Guess()
-    unit, why, sure = _unit_of(named, column.values, words)
-    return Guess(named, unit, f"its name; {why}" if why else "its name", sure)
-
-
-def _unit_of(quantity: str, values: Floats, words: set[str]) -> tuple[str, str, bool]:
-    """Unit of a column by its numbers: the unit, the reason, and whether it is unambiguous."""
-    x = values[np.isfinite(values)]
-    whole = bool((x == np.rint(x)).all())
-    if quantity == "time":
-        step = float(np.median(np.abs(np.diff(x)))) if len(x) > 1 else 1.0
-        step = step or float(np.mean(np.abs(np.diff(x))))
-        if whole and step >= 500.0:
-            return "us", f"whole numbers, {step:g} apart", True
-        if whole and step >= 1.0 and (np.ptp(x) > 1000.0 or "ms" in words or "millis" in words):
-            return "ms", f"whole numbers, {step:g} apart", True
-        return ("s", f"{step:.3g} apart", True) if step < 1.0 else ("", "its unit is not clear", False)
-    if quantity in ("theta", "reference"):
-        return _unit_of_angle(values)
-    top = float(np.abs(x).max())
-    if quantity == "duty":
-        low = float(x.min())
-        if low >= 0.0 and top <= 1.0:
-            return "1", f"up to {top:g}", True
-        if whole and low >= 900.0 and top <= 2100.0:
-            return "counts:1000..2000", f"{low:g} to {top:g}, as pulses in µs", True
-        if low >= 0.0 and top <= 100.0:
-            return "%", f"up to {top:g}", True
-        counts = next((n for n in (255, 1023, 4095, 65535) if top <= n), None)
-        return (f"counts:{counts}", f"whole numbers up to {top:g}", False) if whole and counts and low >= 0.0 else (
-            "", "its unit is not clear", False)
-    if quantity == "omega":
-        return ("rpm", "its name", True) if words & {"rpm", "drehzahl", "giri", "obroty", "обороты", "转速"} else (
-            "", "rad/s or rpm?", False)
-    small, large = ("A", "mA") if quantity == "current" else ("V", "mV")
-    limit = 40.0 if quantity == "current" else 100.0
-    return (small, f"up to {top:.3g}", True) if top < limit else (large, f"up to {top:.3g}", top > 10.0 * limit)
-
-
-def _unit_of_angle(values: Floats) -> tuple[str, str, bool]:
-    x = values[np.isfinite(values)]
-    low, high = float(x.min()), float(x.max())
-    if high - low > 720.0:
-        return "", f"{low:.4g} to {high:.4g}: counts of what?", False
-    if high - low > 7.0:
-        return "deg", f"{low:.4g} to {high:.4g}", True
-    return "rad", f"{low:.4g} to {high:.4g}: rad or deg?", False
-
-
-def _unnamed_time(table: Table, found: list[Guess]) -> list[Guess]:
-    """Take the only column without a name that never decreases as the time."""
-    rising = []
-    for k, (column, one) in enumerate(zip(table.columns, found)):
-        x = column.values[np.isfinite(column.values)]
-        if not one.quantity and not column.is_text and not column.name and len(x) >= FEWEST:
-            steps = np.diff(x)
-            if (steps >= 0.0).all() and steps.max() < 0.3 * np.ptp(x) and np.ptp(x) > 0.0:
-                rising.append(k)
-    if len(rising) == 1:
-        k = rising[0]
-        unit, why, sure = _unit_of("time", table.columns[k].values, set())
-        found = [*found]
-        found[k] = Guess("time", unit, f"it only rises; {why}", sure)
-    return found
+    needed = ("time", "theta", "duty")
+    return {"time", "theta"} <= chosen.keys() and not any(one.quantity in needed and not one.sure for one in found)

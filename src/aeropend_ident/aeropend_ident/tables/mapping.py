@@ -63,6 +63,8 @@ class Plan:
         motor_off: the duty is always 0.
         clock: one of `clock.CLOCKS`.
         skip_bad: skip rows that cannot be read.
+        supply: the voltage of the supply, "12V", for a duty in volts.
+        both_ways: "clip": set what is below 0 in the duty to 0; "" refuses it.
     """
 
     time: str | None = None
@@ -78,6 +80,8 @@ class Plan:
     motor_off: bool = False
     clock: str = "auto"
     skip_bad: bool = False
+    supply: str | None = None
+    both_ways: str = ""
 
     def columns(self) -> dict[str, str]:
         """Quantity -> the column that is given for it."""
@@ -121,7 +125,9 @@ def samples(table: Table, plan: Plan) -> Samples:
     """
     if plan.time is None and plan.rate is None:
         raise TableError(no_time(table))
-    chosen = {name: _chosen(table, name, said) for name, said in plan.columns().items()}
+    chosen = {name: _chosen(table, name, said, plan) for name, said in plan.columns().items()}
+    if plan.supply is not None and " of " not in chosen.get("duty", (0, Unit("", 1.0)))[1].text:
+        raise TableError(f"{table.path}: --supply is for a command in volts: add --duty COLUMN:V, or leave it away")
     twice = [name for name, (k, _) in chosen.items() if [j for j, _ in chosen.values()].count(k) > 1]
     if twice:
         raise TableError(f"{table.path}: column {table.label(chosen[twice[0]][0])} is given as "
@@ -147,7 +153,7 @@ def samples(table: Table, plan: Plan) -> Samples:
         if name in chosen:
             channels[CHANNELS[name]] = chosen[name][1].size * values[name]
     if "duty" in chosen:
-        channels["duty"] = _duty(table, chosen["duty"], values["duty"], notes)
+        channels["duty"] = _duty(table, chosen["duty"], values["duty"], plan, notes)
     elif plan.motor_off:
         channels["duty"] = np.zeros(len(dated.time))
     if not channels.keys() - {"duty"}:
@@ -234,7 +240,7 @@ def _plain(text: str) -> str:
     return "".join(letter for letter in letters if not unicodedata.combining(letter))
 
 
-def _chosen(table: Table, quantity: str, text: str) -> tuple[int, Unit]:
+def _chosen(table: Table, quantity: str, text: str, plan: Plan) -> tuple[int, Unit]:
     found = find(table, text)
     option = f"--{quantity} '{text}'"
     if not found:
@@ -252,6 +258,11 @@ def _chosen(table: Table, quantity: str, text: str) -> tuple[int, Unit]:
         raise TableError(f"{table.path}: {option}: column {table.label(k)} holds no times of day ({column.shown[:1]})")
     if column.is_clock:
         return k, Unit(CLOCK, 1.0)
+    if quantity == "duty" and (volts := _volts(said or column.unit)):
+        if plan.supply is None:
+            raise TableError(f"{table.path}: {option}: a command in volts needs the voltage of the supply, which is "
+                             "full duty: add --supply 12V")
+        return k, Unit(f"{volts.text} of {plan.supply}", volts.size / _supply(plan.supply))
     if not said:
         unit = known(quantity, column.unit) if column.unit else None
         if unit is None:
@@ -262,6 +273,22 @@ def _chosen(table: Table, quantity: str, text: str) -> tuple[int, Unit]:
         return k, parse(quantity, said)
     except UnitError as error:
         raise TableError(f"{table.path}: {option}: {error}") from None
+
+
+def _volts(text: str) -> Unit | None:
+    """A unit of a voltage; None for another."""
+    try:
+        return parse("voltage", text)
+    except UnitError:
+        return None
+
+
+def _supply(text: str) -> float:
+    """[V] The voltage of the supply, from "12V" or "12"."""
+    unit = _volts(text) or _volts(f"{text}V")
+    if unit is None or not 0.0 < unit.size < math.inf:
+        raise TableError(f"--supply '{text}': give its voltage, as in --supply 12V")
+    return unit.size
 
 
 def _readable_rows(table: Table, used: list[int], plan: Plan, notes: list[str]) -> Ints:
@@ -290,8 +317,11 @@ def _date(table: Table, plan: Plan, chosen: dict[str, tuple[int, Unit]], keep: I
     number, unit = chosen["time"]
     angle = table.columns[chosen["theta"][0]].values[keep] if "theta" in chosen else np.full(len(keep), np.nan)
     column = table.columns[number]
+    stamps = column.values[keep]
+    if unit.size == UNITS["time"]["day"]:  # since a day long ago, as in MATLAB and Excel
+        stamps = stamps - np.floor(np.nanmin(stamps))
     try:
-        return clock.date(unit.size * column.values[keep], angle, table.lines[keep], is_clock=column.is_clock,
+        return clock.date(unit.size * stamps, angle, table.lines[keep], is_clock=column.is_clock,
                           tick=unit.size, repeats=_repeats(table)[keep], clock=plan.clock,
                           lengths=None if table.lengths is None else table.lengths[keep])
     except ClockError as error:
@@ -360,14 +390,19 @@ def _zero(table: Table, text: str, unit: Unit, read: Floats, dated: Dated) -> fl
         raise TableError(f"{table.path}: --zero '{text}': {error}") from None
 
 
-def _duty(table: Table, chosen: tuple[int, Unit], raw: Floats, notes: list[str]) -> Floats:
+def _duty(table: Table, chosen: tuple[int, Unit], raw: Floats, plan: Plan, notes: list[str]) -> Floats:
     unit = chosen[1]
     duty = unit.size * (raw - unit.low)
+    backward = int((duty < -CLIPPED).sum())
+    if plan.both_ways == "clip" and backward:
+        notes.append(f"duty: {counted(backward, 'row')} of {len(duty)} below 0, down to "
+                     f"{100.0 * float(np.nanmin(duty)):.3g} %, set to 0 (as you say)")
+        duty = np.maximum(duty, 0.0)
     low, high = float(np.nanmin(duty)), float(np.nanmax(duty))
     if low < -CLIPPED or high > 1.0 + CLIPPED:
         worst = float(np.nanmin(raw)) if low < -CLIPPED else float(np.nanmax(raw))
-        why = ("the motor of the model turns one way only" if low < -CLIPPED and high <= 1.0 + CLIPPED else
-               "is its unit right?")
+        why = (f"the motor of the model turns one way only; --both-ways clip sets {counted(backward, 'row')} of "
+               f"{len(duty)} to 0" if low < -CLIPPED and high <= 1.0 + CLIPPED else "is its unit right?")
         raise TableError(f"{table.path}: column {table.label(chosen[0])} as a duty in {unit.text} goes to {worst:g}, "
                          f"outside 0..100 %: {why}")
     outside = int(((duty < 0.0) | (duty > 1.0)).sum())

@@ -21,12 +21,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.io.matlab import MatlabOpaque
 
-from aeropend_ident.tables.files import HDF5, MOST_UNPACKED, Arrays
+from aeropend_ident.tables.files import HDF5, MOST_UNPACKED, OPAQUE, Arrays, is_matlab_4
 from aeropend_ident.tables.table import MOST_NUMBERS, TableError, check_size
 
 DEEPEST = 4
 """Greatest depth of nested structures (choice)."""
+
+MOST_RECORDS = 64
+"""Greatest number of records in an array of structures, as of the signals of a scope (choice)."""
 
 MOST_MEMORY = 6 << 30
 """[bytes] Limit of the memory of this program (choice)."""
@@ -56,7 +60,10 @@ def _mat(path: Path) -> Arrays:
     """Read a file up to version 7.2."""
     from scipy.io import loadmat
 
-    _check_mat(path)
+    with path.open("rb") as file:
+        old = is_matlab_4(file.read(132))
+    if not old:  # whose matrices are not compressed
+        _check_mat(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of variables that it cannot read: they are missing, which is said
@@ -110,11 +117,26 @@ def _flat(tree: Mapping[str, Any], prefix: str = "", depth: int = 0) -> Iterator
         array = np.asarray(value)
         while array.dtype == object and array.size == 1 and isinstance(array.flat[0], np.ndarray):
             array = array.flat[0]
-        if array.dtype.names and array.size == 1 and depth < DEEPEST:
+        if isinstance(value, MatlabOpaque):
+            yield prefix + name.removeprefix("None") + OPAQUE, np.zeros(0)
+        elif array.dtype.names and array.size == 1 and depth < DEEPEST:
             record = array.flat[0]
             yield from _flat({key: record[key] for key in array.dtype.names}, f"{prefix}{name}.", depth + 1)
+        elif array.dtype.names and 1 < array.size <= MOST_RECORDS and depth < DEEPEST:
+            for k, record in enumerate(array.flat):
+                fields = {key: record[key] for key in array.dtype.names}
+                label = _text(fields.pop("label", None)) or f"{name}({k + 1})"
+                yield from _flat(fields, f"{prefix}{label}.", depth + 1)
+        elif array.dtype == object and 1 < array.size <= MOST_RECORDS and depth < DEEPEST:
+            yield from _flat({f"{name}{{{k + 1}}}": cell for k, cell in enumerate(array.flat)}, prefix, depth + 1)
         else:
             yield prefix + name, array
+
+
+def _text(value: Any) -> str:
+    """The text in an array; "" without one."""
+    array = np.asarray(value)
+    return str(array.flat[0]).strip() if array.dtype.kind == "U" and array.size == 1 else ""
 
 
 def _hdf5(path: Path) -> Arrays:

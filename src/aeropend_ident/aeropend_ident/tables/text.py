@@ -12,7 +12,7 @@ import csv
 import re
 from array import array
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
@@ -45,6 +45,9 @@ COMMENTS = ("#", "%", "//")
 ARROW = " -> "
 """Text of the Arduino IDE between the time of arrival of a line and the line."""
 
+OTHER_NAMES = 2
+"""Greatest difference between the numbers of names and of columns for a line to be one of names (choice)."""
+
 READABLE = 0.6
 """Least share of readable cells in the sample, for a table of one column (choice)."""
 
@@ -63,22 +66,25 @@ class Dialect:
     """How a text file is to be read.
 
     Attributes:
-        delimiter: one of `DELIMITERS`. decimal: "." or ",".
+        delimiter: one of `DELIMITERS`.
+        decimals: "." or ",", of each column.
         width: cells in a line.
         first: line (from 1 on) with the first numbers.
         names, units: of the columns; "" where there are none.
         clocks: whether a column holds times of day.
         texts: whether a column holds hardly any number.
+        note: on names that do not fit the columns; "" if they do.
     """
 
     delimiter: str
-    decimal: str
+    decimals: tuple[str, ...]
     width: int
     first: int = 1
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
     clocks: tuple[bool, ...] = ()
     texts: tuple[bool, ...] = ()
+    note: str = ""
 
 
 def number(cell: str, decimal: str) -> float | None:
@@ -127,8 +133,13 @@ def read_text(path: Path, delimiter: str | None = None, decimal: str | None = No
     encoding, notes = _encoding(path)
     sample = [line for line, _ in zip(_lines(path, encoding), range(SAMPLE))]
     dialect = _head(path, sample, _dialect(path, sample, delimiter, decimal))
-    if dialect.decimal == ",":
-        notes.append("numbers have a decimal comma")
+    commas = [k for k, mark in enumerate(dialect.decimals) if mark == ","]
+    if commas:
+        where = "" if len(commas) == dialect.width else f" in column{'s' * (len(commas) > 1)} " + ", ".join(
+            f"{k + 1}" for k in commas) + ", in others a decimal point"
+        notes.append(f"numbers have a decimal comma{where}")
+    if dialect.note:
+        notes.append(dialect.note)
     return _Reading(path, dialect, notes).table(_lines(path, encoding))
 
 
@@ -193,7 +204,7 @@ def _has_thousands(cell: str) -> bool:
 
 
 def _dialect(path: Path, sample: Sequence[str], delimiter: str | None, decimal: str | None) -> Dialect:
-    """Find delimiter, decimal mark and width: those with which most cells of the sample can be read."""
+    """Find delimiter, decimal marks and width: those with which most cells of the sample can be read."""
     lines = [line for line in sample if line.strip() and not _is_comment(line)]
     if not lines:
         raise TableError(f"{path}: the file is empty")
@@ -204,27 +215,40 @@ def _dialect(path: Path, sample: Sequence[str], delimiter: str | None, decimal: 
         width = max(widths, key=lambda w: (widths[w], w))
         rows = [row for row in (split(line, d) for line in lower) if len(row) == width]
         same = sum(len(split(line, d)) == width for line in lines) / len(lines)
-        for mark in (decimal,) if decimal else (".", ","):
-            filled = [cell for row in rows for cell in row if cell.casefold() not in EMPTY]
-            readable = sum(_readable(cell, mark) or _has_thousands(cell) for cell in filled)
-            share = readable / max(len(filled), 1) * len(rows) / len(lower)
-            score = (round(share, 2), round(same, 1), width)
-            if best is None or score > best[0]:
-                best = score, Dialect(d, mark, width)
+        filled = [[cell for cell in cells if cell.casefold() not in EMPTY] for cells in zip(*rows)]
+        readable = [{mark: sum(_readable(cell, mark) or _has_thousands(cell) for cell in cells)
+                     for mark in ((decimal,) if decimal else (".", ","))} for cells in filled]
+        marks = _marks(readable)
+        count = sum(one[mark] for one, mark in zip(readable, marks))
+        share = count / max(sum(map(len, filled)), 1) * len(rows) / len(lower)
+        score = (round(share, 2), round(same, 1), width)
+        if best is None or score > best[0]:
+            best = score, Dialect(d, marks, width)
     assert best is not None
     (share, _, _), found = best
-    cells = [cell for line in lines for cell in split(line, found.delimiter)]
     if decimal is None:
-        _check_marks(path, found, cells)
+        _check_marks(path, found, [split(line, found.delimiter) for line in lines])
     if share == 0.0 or (share < READABLE and found.width == 1):
         raise TableError(f"{path}: no table of numbers is found in it")
     return found
 
 
-def _check_marks(path: Path, dialect: Dialect, cells: Sequence[str]) -> None:
+def _marks(readable: Sequence[Mapping[str, int]]) -> tuple[str, ...]:
+    """The decimal mark of each column; that of the others where a column does not tell.
+
+    Args:
+        readable: number of readable cells by mark, of each column.
+    """
+    clear = {max(one, key=lambda mark: one[mark]) for one in readable if len(set(one.values())) > 1}
+    usual = clear.pop() if len(clear) == 1 else min(readable[0], default=".", key=".,".index) if readable else "."
+    return tuple(max(one, key=lambda mark: one[mark]) if len(set(one.values())) > 1 else usual for one in readable)
+
+
+def _check_marks(path: Path, dialect: Dialect, rows: Sequence[Sequence[str]]) -> None:
     """Refuse commas that may be decimal commas or mark thousands."""
-    commas = [cell for cell in cells if "," in cell and _COMMA_NUMBER.match(cell)]
-    if dialect.decimal == "," and commas and all(_MAYBE_THOUSANDS.match(cell) for cell in commas):
+    commas = [cell for row in rows for cell, mark in zip(row, dialect.decimals)
+              if mark == "," and "," in cell and _COMMA_NUMBER.match(cell)]
+    if commas and all(_MAYBE_THOUSANDS.match(cell) for cell in commas):
         raise TableError(f"{path}: '{commas[0]}' may have a decimal comma or mark thousands: say --decimal , or write "
                          "the numbers without marks of thousands")
 
@@ -237,7 +261,7 @@ def _head(path: Path, sample: Sequence[str], dialect: Dialect) -> Dialect:
     clocks, texts = [], []
     for column in range(dialect.width):
         cells = [row[column] for row in lower if row[column].casefold() not in EMPTY]
-        plain = sum(number(cell, dialect.decimal) is not None for cell in cells)
+        plain = sum(number(cell, dialect.decimals[column]) is not None for cell in cells)
         timed = sum(clock(cell) is not None for cell in cells)
         clocks.append(timed > plain)
         texts.append(max(timed, plain) < 0.5 * len(cells))
@@ -246,35 +270,54 @@ def _head(path: Path, sample: Sequence[str], dialect: Dialect) -> Dialect:
     if dialect.delimiter == "," and start and 2 * len(rows[start - 1][1]) == dialect.width:
         raise TableError(f"{path}: line {first} has twice as many cells as line {rows[start - 1][0]} has names: if "
                          "commas are decimal marks, they cannot split the cells as well; write it with semicolons")
+    used = max((k + 1 for row in lower for k, cell in enumerate(row) if cell), default=dialect.width)
     above = [row for _, row in rows[:start] if _fits(row, dialect.width)]
     units: list[str] = []
     if above and all(not cell or is_unit(without_brackets(cell)) for cell in above[-1]) and any(above[-1]):
         units = [without_brackets(cell) for cell in above.pop()]
-    names = above[-1] if above else _commented(sample[: first - 1], dialect)
-    names = (names + [""] * dialect.width)[: dialect.width]
+    names = above[-1] if above else _commented(sample[: first - 1], dialect, used)
+    names, note = _named(names, dialect.width, used)
     own = [split_name(name)[1] for name in names]
     units = (units + [""] * dialect.width)[: dialect.width]
-    return Dialect(dialect.delimiter, dialect.decimal, dialect.width, first, tuple(names),
-                   tuple(line or name for line, name in zip(units, own)), tuple(clocks), tuple(texts))
+    return Dialect(dialect.delimiter, dialect.decimals, dialect.width, first, tuple(names),
+                   tuple(line or name for line, name in zip(units, own)), tuple(clocks), tuple(texts), note)
+
+
+def _named(names: list[str], width: int, used: int) -> tuple[list[str], str]:
+    """A name for each column, and a note: names of another number than the columns say nothing about which is which.
+
+    Args:
+        names: in the file.
+        width: number of cells in a line.
+        used: number of the last column that is not empty.
+    """
+    cells = len(names)
+    while names and not names[-1]:
+        names = names[:-1]
+    if names and cells != width and len(names) != used:
+        return [""] * width, (f"{counted(len(names), 'name')} ({', '.join(names)}) for {counted(used, 'column')}: "
+                              "which belongs to which is not clear, so that columns have numbers only")
+    return names + [""] * (width - len(names)), ""
 
 
 def _fits(row: Sequence[str], width: int) -> bool:
-    return len(row) == width or (len(row) in (width - 1, width + 1) and len(row) > 1 and all(row[:-1]))
+    return len(row) == width or (abs(len(row) - width) <= OTHER_NAMES and len(row) > 1 and all(row[:-1]))
 
 
 def _is_data(row: Sequence[str], dialect: Dialect, texts: Sequence[bool]) -> bool:
     if len(row) != dialect.width:
         return False
-    cells = [cell for cell, is_text in zip(row, texts) if not is_text and cell.casefold() not in EMPTY]
-    return bool(cells) and all(_readable(cell, dialect.decimal) for cell in cells)
+    cells = [(cell, mark) for cell, mark, is_text in zip(row, dialect.decimals, texts)
+             if not is_text and cell.casefold() not in EMPTY]
+    return bool(cells) and all(_readable(cell, mark) for cell, mark in cells)
 
 
-def _commented(lines: Sequence[str], dialect: Dialect) -> list[str]:
+def _commented(lines: Sequence[str], dialect: Dialect, used: int) -> list[str]:
     """Names in a comment or between blanks; none if their number does not fit."""
     for line in reversed([line for line in lines if line.strip()][-2:]):
         text = line.strip().lstrip("#%/").strip()
         for names in (split(text, dialect.delimiter), re.split(r"\s{2,}|\t", text), _WORDS.findall(text)):
-            if len(names) == dialect.width and (_is_comment(line) or dialect.delimiter == " "):
+            if len(names) in (dialect.width, used) and (_is_comment(line) or dialect.delimiter == " "):
                 return names
     return []
 
@@ -353,7 +396,7 @@ class _Reading:
             store.values.extend(self._numbers(column, store, cells, start))
 
     def _numbers(self, column: int, store: _Store, cells: Sequence[str], start: int) -> list[float]:
-        is_clock, decimal = self.dialect.clocks[column], self.dialect.decimal
+        is_clock, decimal = self.dialect.clocks[column], self.dialect.decimals[column]
         if self.dialect.texts[column]:
             if not store.complaint:
                 found = next((k for k, cell in enumerate(cells) if not _readable(cell, decimal)), None)
@@ -386,11 +429,11 @@ class _Reading:
             return f"{where}: '{shown}' is no time of day"
         if _THOUSANDS.match(cell):
             return f"{where}: '{shown}' marks thousands: write numbers without such marks"
-        if number(cell, "," if self.dialect.decimal == "." else ".") is not None:
+        own = self.dialect.decimals[column]
+        other = "," if own == "." else "."
+        if number(cell, other) is not None:
             mark = {".": "point", ",": "comma"}
-            other = "," if self.dialect.decimal == "." else "."
-            return (f"{where}: '{shown}' has a decimal {mark[other]}, where others have a decimal "
-                    f"{mark[self.dialect.decimal]}")
+            return f"{where}: '{shown}' has a decimal {mark[other]}, where others have a decimal {mark[own]}"
         return f"{where}: '{shown}' is not a number"
 
     def _done(self) -> Table:

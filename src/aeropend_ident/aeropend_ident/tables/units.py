@@ -50,6 +50,9 @@ UNITS: dict[str, dict[str, float]] = {
 LISTED = {"time": 8, "theta": 4, "duty": 3, "omega": 5, "current": 3, "voltage": 2, "reference": 4}
 """Number of units of each quantity that messages list."""
 
+NAMES_TOO = ("d", "h", "1", "-")
+"""Units that are no unit where they are the whole name of a column; nor are spellings like `a` for A."""
+
 COUNTED = ("theta", "duty", "reference")
 """Quantities that may be given in counts."""
 
@@ -142,7 +145,7 @@ def split_name(name: str) -> tuple[str, str]:
     Returns:
         The name, and the unit as in the text; "" without a known unit.
     """
-    if is_unit(name):
+    if is_unit(name) and name.strip() not in NAMES_TOO and any(name.strip() in units for units in UNITS.values()):
         return name.strip(), name.strip()
     for pattern in (_BRACKETS, _SLASH, _TAIL):
         match = pattern.match(name.strip())

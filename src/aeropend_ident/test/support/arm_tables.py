@@ -11,6 +11,23 @@ RATE = 50.0
 TIME = np.arange(200) / RATE
 ANGLE = 40.0 * np.exp(-0.1 * TIME) * np.cos(6.0 * TIME)  # deg
 DUTY = np.floor(TIME) % 2 * 30.0  # %
+PUSH = np.tile(np.repeat([0.0, 60.0, 20.0, 80.0, 0.0, 40.0], 50), 2)  # %
+
+
+def driven(push=PUSH, rate=RATE):
+    """The angle [deg] of an arm that a command moves: it follows late, and swings."""
+    theta, speed, thrust, out = 0.0, 0.0, 0.0, []
+    for u in push:
+        out.append(np.degrees(theta))
+        for _ in range(20):
+            thrust += (u / 100.0 - thrust) / 0.1 / rate / 20.0
+            speed += (36.0 * (thrust * thrust - np.sin(theta)) - 1.5 * speed) / rate / 20.0
+            theta += speed / rate / 20.0
+    return np.array(out)
+
+
+DRIVEN = driven()
+LONG = np.arange(len(PUSH)) / RATE
 MAPPED = ("--time", "t:s", "--theta", "x:deg")
 
 

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Columns are recognised by names and numbers together, and what is in doubt is asked."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from arm_tables import DRIVEN, LONG, PUSH, RATE, driven
+
+from aeropend_ident.tables.guess import Given, guess, options
+from aeropend_ident.tables.names import meaning
+from aeropend_ident.tables.sparkline import sparkline
+from aeropend_ident.tables.table import Column, Table
+from aeropend_ident.tables.traits import traits
+from aeropend_ident.tables.units import split_name
+
+RNG = np.random.default_rng(5)
+NOISY = DRIVEN + 0.05 * RNG.standard_normal(len(DRIVEN))
+FILTERED = np.convolve(NOISY, np.ones(9) / 9.0)[: len(NOISY)]
+GOAL = np.repeat(RNG.uniform(5.0, 40.0, 6), 100)
+
+
+def loop(seed=3):
+    """Angle [deg] and command [%] of an arm in a loop that follows `GOAL`."""
+    theta = speed = thrust = total = before = 0.0
+    angle, command = [], []
+    rng = np.random.default_rng(seed)
+    for goal in GOAL:
+        shown = np.degrees(theta)
+        total = min(max(total + 2.0 * (goal - shown) / RATE, 0.0), 100.0)
+        u = min(max(1.0 * (goal - shown) + total - 0.3 * RATE * (shown - before), 0.0), 100.0)
+        before = shown
+        angle.append(shown)
+        command.append(u + 0.05 * rng.standard_normal() if 0.0 < u < 100.0 else u)
+        for _ in range(20):
+            thrust += (u / 100.0 - thrust) / 0.1 / RATE / 20.0
+            speed += (36.0 * (thrust * thrust - np.sin(theta)) - 1.5 * speed) / RATE / 20.0
+            theta += speed / RATE / 20.0
+    return np.array(angle), np.array(command)
+
+
+HELD, CONTROLLED = loop()
+
+
+def found(given=None, **columns):
+    """The guesses for a table, by the names of its columns, and the sure options."""
+    table = Table(Path("run.csv"), tuple(Column(name, np.asarray(x, float), split_name(name)[1])
+                                         for name, x in columns.items()), np.arange(len(LONG)))
+    guesses = guess(table, given)
+    return dict(zip(columns, guesses)), options(table, guesses)
+
+
+@pytest.mark.promise("Tables", "`import` recognises columns by their numbers, too")
+def test_columns_without_a_telling_name_are_recognised_by_their_numbers():
+    _, sure = found(c1=LONG, c2=PUSH / 100.0, c3=NOISY)
+    assert sure == {"time": "c1:s", "theta": "c3:deg", "duty": "c2:1"}
+    _, sure = found(ch0=1e3 * LONG + 7.0, ch1=np.radians(DRIVEN), ch2=PUSH / 200.0)
+    assert sure == {"time": "ch0:ms", "theta": "ch1:rad", "duty": "ch2:1"}
+
+
+@pytest.mark.parametrize(("t", "y", "u", "r", "e"), [
+    ("t", "y", "u", "r", "e"), ("Zeit", "Istwert", "Stellwert", "Sollwert", "Regelabweichung"),
+    ("Tiempo", "ANGULO", "CONTROL", "REFERENCIA", "ERROR"), ("tempo", "saída", "entrada", "referência", "erro"),
+    ("temps", "sortie", "commande", "consigne", "écart"), ("tempo", "uscita", "ingresso", "riferimento", "errore"),
+    ("czas", "kąt", "sterowanie", "zadana", "uchyb"), ("zaman", "açı", "kontrol", "hedef", "hata"),
+    ("time", "PV", "CO", "SP", "err"), ("time", "pitch", "U_PITCH", "pitch_ref", "pitch error"),
+    ("t", "theta", "u(t)", "theta_d", "e_theta"), ("time", "output", "input", "setpoint", "error"),
+])  # fmt: skip
+def test_names_of_many_habits_in_a_loop(t, y, u, r, e):
+    guesses, sure = found(**{t: LONG, y: HELD, u: CONTROLLED, r: GOAL, e: GOAL - HELD})
+    assert sure["time"] == f"{t}:s"
+    assert sure["theta"] == f"{y}:deg"
+    assert sure["duty"] == f"{u}:%"
+    assert guesses[e].quantity == ""
+    assert "difference" in guesses[e].why
+
+
+@pytest.mark.promise("Tables", "What `import` is not sure of is asked, and never used")
+@pytest.mark.parametrize(("columns", "quantity", "why"), [
+    ({"t": LONG, "angle": PUSH, "pwm": DRIVEN}, "theta", "does not move as an arm"),
+    ({"t": LONG, "PITCH": DRIVEN, "E_PITCH": PUSH / 4.0}, "duty", "its name says error"),
+    ({"t": LONG, "a": DRIVEN, "b": driven(PUSH[::-1])}, "theta", "or column"),
+    ({"t [s]": 1e3 * LONG, "angle": DRIVEN}, "time", "20 apart?"),
+    ({"t": LONG, "angle": np.rint(512.0 + DRIVEN * 2.84)}, "theta", "counts of a turn?"),
+    ({"t": LONG, "angle": DRIVEN, "pwm": np.rint(9.0 * PUSH)}, "duty", "or of others?"),
+    ({"t": LONG, "angle": DRIVEN, "v": PUSH / 10.0}, "duty", "of which supply?"),
+    ({"t": LONG, "angle": DRIVEN, "u": PUSH - 10.0}, "duty", "it goes both ways, -10 to 70"),
+])  # fmt: skip
+def test_what_is_in_doubt_is_not_sure(columns, quantity, why):
+    guesses, sure = found(**columns)
+    assert quantity not in sure
+    assert [one.why for one in guesses.values() if one.quantity == quantity and why in one.why]
+
+
+def test_a_reference_is_not_taken_for_a_command_that_is_not_there():
+    _, sure = found(x1=LONG, x2=HELD, x3=GOAL)
+    assert "duty" not in sure
+    _, sure = found(x1=LONG, x2=HELD, x3=GOAL - HELD)
+    assert "duty" not in sure
+
+
+def test_columns_that_follow_from_others_are_said_to():
+    guesses, sure = found(t=LONG, x=DRIVEN, x_=FILTERED, z=np.gradient(DRIVEN, LONG), turned=np.radians(DRIVEN),
+                          u=PUSH / 100.0)
+    assert guesses["x_"].why.startswith("a filtered copy of column")
+    assert guesses["z"].why.startswith("a derivative of column")
+    assert "the same as column" in guesses["turned"].why
+    assert sure == {"time": "t:s", "theta": "x:deg", "duty": "u:1"}
+
+
+def test_what_the_user_says_makes_volts_and_both_ways_sure():
+    volts = {"t": LONG, "angle": DRIVEN, "u [V]": PUSH / 10.0 - 1.0}
+    assert "duty" not in found(**volts)[1]
+    assert "duty" not in found(Given(supply=True), **volts)[1]
+    assert found(Given(supply=True, clip=True), **volts)[1]["duty"] == "u [V]"
+
+
+def test_the_scales_do_not_matter_for_what_a_column_is():
+    one, other = traits(DRIVEN), traits(1e6 + 1e-3 * DRIVEN)
+    assert (one.block, one.holds, one.rough, one.noisy) == (other.block, other.holds, other.rough, other.noisy)
+
+
+@pytest.mark.parametrize(("name", "quantity"), [
+    ("theta_ref", "reference"), ("Winkelgeschwindigkeit", "angle rate"), ("θ", "theta"), ("pwmOut", "duty"),
+    ("kąt", "theta"), ("Führungsgröße", "reference"), ("angle_filt", "filtered"), ("battery", "supply"),
+    ("y(t)", "theta"), ("u_t", "duty"), ("k*Ts", "time"), ("ch3", ""), ("motor current", "current"),
+])  # fmt: skip
+def test_meanings_of_names(name, quantity):
+    assert meaning(name).quantity == quantity
+
+
+def test_a_small_picture_of_a_column():
+    assert sparkline(np.repeat([0.0, 1.0], 12)) == "▁" * 12 + "█" * 12
+    assert sparkline(np.repeat([0.0, 1.0], 12), "ascii") == "_" * 12 + "#" * 12
+    assert sparkline(np.repeat([np.nan, 1.0], 12)) == " " * 12 + "▁" * 12
+    assert sparkline(np.full(9, np.nan)) == ""
