@@ -7,8 +7,8 @@
 
 right: time, angle and command are those of the rig. asked: import does not use what it is not sure of. refused: it
 cannot read the file. wrong: it made a recording that is not that of the rig. Of some tables nobody could know all
-without asking (the supply of a command in volts, the counts of a turn): the share of right answers is that of the others.
-Seeds below 1000 are for development.
+without asking (the supply of a command in volts, the counts of a turn): the share of right answers is that of the
+others. Seeds below 1000 are for development.
 """
 
 from __future__ import annotations
