@@ -139,6 +139,22 @@ def test_a_verdict_without_estimates_is_refused_in_one_line(monday, tmp_path):
         since.read([folder])
 
 
+@pytest.mark.parametrize("harm", [
+    {"names": ["colour"], "values": [1.0], "covariance": [[1.0]]},
+    {"names": ["R_a", "K_e"], "values": [1.0], "covariance": [[1.0]]},
+    {"names": ["R_a"], "values": [1.0], "covariance": [[-1.0]]},
+    {"names": ["R_a", "R_a"], "values": [1.0, 1.0], "covariance": [[1.0, 0.0], [0.0, 1.0]]},
+    {"names": ["coulomb_friction.colour"], "values": [1.0], "covariance": [[1.0]]},
+    {"names": ["R_a", "K_e"], "values": [1.0, 1.0], "covariance": [[1.0], [0.0, 1.0]]}])
+def test_estimates_that_make_no_sense_are_refused_in_one_line(monday, tmp_path, harm):
+    body = json.loads((monday / "diagnosis.json").read_text())
+    (tmp_path / "diagnosis.json").write_text(json.dumps({**body, "estimates": harm}))
+    (tmp_path / "augmented.yaml").write_text((monday / "augmented.yaml").read_text())
+    with pytest.raises(DocumentError, match=r"diagnosis\.json: estimates: .*diagnose the recording again") as error:
+        since.read([tmp_path])
+    assert "\n" not in str(error.value)
+
+
 @pytest.mark.parametrize("other", [["--model", "thesis"], ["--uncalibrated"], ["--each"]])
 def test_since_and_another_model_contradict_each_other(other, capsys):
     with pytest.raises(SystemExit):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis import document
-from aeropend_ident.diagnosis.chain.known import Known, limits, pooled
+from aeropend_ident.diagnosis.chain.known import Known, is_parameter, limits, pooled
 from aeropend_ident.diagnosis.chain.values import neutral, with_values
 from aeropend_ident.diagnosis.document import Change, DiagnosisDocument, DocumentError, Estimates, Interval, Since
 from aeropend_ident.diagnosis.joint_fit import WIDER, JointFit
@@ -20,6 +20,7 @@ from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.statistics import Z95
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import Model, load
+from aeropend_sim.untrusted import one_line
 
 Array = NDArray[np.float64]
 
@@ -44,18 +45,33 @@ def read(folders: Sequence[Path]) -> tuple[Model, Known, list[DiagnosisDocument]
     """
     documents = [document.read(folder / "diagnosis.json") for folder in folders]
     models = [load(folder / "augmented.yaml") for folder in folders]
-    for folder, d in zip(folders, documents, strict=True):
-        if d.estimates is None:
-            raise DocumentError(f"{folder / 'diagnosis.json'}: holds no estimates to compare with: the model could "
-                                "not be identified, or an older version wrote it; diagnose the recording again")
-    known = pooled([Known(e.names, np.array(e.values), np.array(e.covariance), (folder.name,))
-                    for folder, e in zip(folders, (d.estimates for d in documents), strict=True) if e is not None])
+    known = pooled([_known(d, folder) for d, folder in zip(documents, folders, strict=True)])
     model = models[-1]
     for other in models[:-1]:
         missing = {e: p for e, p in other.effects.items() if e not in model.effects}
         model = model.with_effects({**model.effects, **missing})
     found = with_values(model, dict(zip(known.names, known.values.tolist(), strict=True)))
     return Model(f"{known.verdicts[-1]}, augmented", found.model, found.sensing, found.effects), known, documents
+
+
+def _known(verdict: DiagnosisDocument, folder: Path) -> Known:
+    """The estimates of a verdict; the file may come from anywhere."""
+    e, path = verdict.estimates, folder / "diagnosis.json"
+    if e is None:
+        raise DocumentError(f"{path}: holds no estimates to compare with: the model could not be identified, or an "
+                            "older version wrote it; diagnose the recording again")
+    odd = [name for name in e.names if not is_parameter(name)]
+    if odd:
+        raise DocumentError(f"{path}: estimates: '{one_line(odd[0])}' is no parameter of model or effect; diagnose the "
+                            "recording again")
+    values = np.array(e.values)
+    square = all(len(row) == len(e.names) for row in e.covariance) and len(e.covariance) == len(e.names) == len(values)
+    covariance = np.array(e.covariance if square else [[np.nan]])
+    if not (square and len(set(e.names)) == len(e.names) and np.isfinite(values).all() and np.isfinite(covariance).all()
+            and np.allclose(covariance, covariance.T) and (np.diag(covariance) >= 0.0).all()):
+        raise DocumentError(f"{path}: estimates: names, values and covariance do not belong together; diagnose the "
+                            "recording again")
+    return Known(e.names, values, covariance, (folder.name,))
 
 
 def estimates(joint: JointFit) -> Estimates:

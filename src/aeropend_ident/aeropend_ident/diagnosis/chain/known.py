@@ -76,6 +76,14 @@ def limits(name: str) -> EffectParameter | ModelParameter:
         name if k.owner else f"model.{name}"]
 
 
+def is_parameter(name: str) -> bool:
+    """Whether it names a parameter of the model, the filter of the measurement chain, or a parameter of an effect."""
+    k = key(name)
+    if k.owner in CATALOGUE:
+        return k.name in CATALOGUE[k.owner].parameters and k.plain == name
+    return name in PLACE_OF_PARAMETER
+
+
 def stage_of(name: str) -> str:
     """The first stage in which a parameter of the model or of an effect acts."""
     owner = key(name).owner
