@@ -160,3 +160,15 @@ def test_since_and_another_model_contradict_each_other(other, capsys):
     with pytest.raises(SystemExit):
         command.parse(["bag", "--since", "monday", *other])
     assert "contradict each other" in capsys.readouterr().err
+
+
+@pytest.mark.promise("Verdict", "A gust that was not there is a change; one that was there is none")
+def test_a_gust_that_was_not_there_has_appeared(monday):
+    windy = RIG.with_effects({**RIG.effects, "gust": {"sigma": 1.5, "tau": 0.3}})
+    found = tuesday(monday, windy)
+    assert [(c.name, c.before) for c in found.conclusions.since.changes if c.claimed] == [("gust.sigma", None)]
+    e = found.conclusions.estimates
+    assert e.values[e.names.index("gust.sigma")] == pytest.approx(1.5, rel=0.2)
+    known = Known(e.names, np.array(e.values), np.array(e.covariance), ("windy",))
+    again = diagnose(found.augmented, [recorded(windy, 504)], 2, known=known).conclusions
+    assert [c.name for c in again.since.changes if c.claimed] == []

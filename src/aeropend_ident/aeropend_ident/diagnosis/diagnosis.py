@@ -406,8 +406,9 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
         closure=Closure(gaps.before.total, gaps.after.total, gaps.before.total_floor(gaps.floors), closed, low, high,
                         budget=gaps.budget(gust=found.statistical.gust is not None)),
         identified=None if calibrated else conclude.identified_model(chains, joint, rows),
-        since=None if chains.known is None else since.changes(chains.known, joint, head.claimed),
-        estimates=None if failed else since.estimates(joint))
+        since=None if chains.known is None else since.changes(
+            chains.known, joint, found.statistical, head.claimed),
+        estimates=None if failed else since.estimates(joint, found.statistical))
 
 
 def _why_not_predicted(chains: CutChains, gaps: _Gaps) -> str:

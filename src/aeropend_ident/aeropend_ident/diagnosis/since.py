@@ -10,12 +10,14 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from aeropend_ident.diagnosis import document
 from aeropend_ident.diagnosis.chain.known import Known, is_parameter, limits, pooled
 from aeropend_ident.diagnosis.chain.values import neutral, with_values
+from aeropend_ident.diagnosis.conclude import Statistical
 from aeropend_ident.diagnosis.document import Change, DiagnosisDocument, DocumentError, Estimates, Interval, Since
-from aeropend_ident.diagnosis.joint_fit import WIDER, JointFit
+from aeropend_ident.diagnosis.joint_fit import SURE, WIDER, JointFit
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.statistics import Z95
 from aeropend_sim.model.effects import CATALOGUE
@@ -74,8 +76,15 @@ def _known(verdict: DiagnosisDocument, folder: Path) -> Known:
     return Known(e.names, values, covariance, (folder.name,))
 
 
-def estimates(joint: JointFit) -> Estimates:
-    """The estimates of a joint fit with their covariance; those that each recording has of its own as their mean."""
+def estimates(joint: JointFit, statistical: Statistical) -> Estimates:
+    """The estimates of a diagnosis with their covariance.
+
+    Those that each recording has of its own count as their mean.
+
+    Args:
+        joint: the joint fit.
+        statistical: effects that were detected by their statistics.
+    """
     names = [n for n in joint.values if not key(n).is_initial]
     of_fit = list(joint.fit.values)
     at = [of_fit.index(n) for n in names]
@@ -91,15 +100,19 @@ def estimates(joint: JointFit) -> Estimates:
         runs = values[weights > 0.0]
         if len(runs) > 1:  # a further recording differs from the mean by the scatter between recordings
             own[j, j] += max(float(np.var(runs, ddof=1)) - own[j, j], 0.0)
-    return Estimates(tuple(plain), tuple((mean @ values).tolist()), tuple(tuple(row) for row in own.tolist()))
+    random = {n: (v, s.fit.sd[n]) for s in statistical.found for n, v in s.fit.values.items()}
+    own = block_diag(own, np.diag([sd**2 for _, sd in random.values()]))
+    return Estimates((*plain, *random), (*(mean @ values).tolist(), *(v for v, _ in random.values())),
+                     tuple(tuple(row) for row in own.tolist()))
 
 
-def changes(known: Known, joint: JointFit, claimed: Container[str]) -> Since:
+def changes(known: Known, joint: JointFit, statistical: Statistical, claimed: Container[str]) -> Since:
     """What has changed, and what has not.
 
     Args:
         known: what the earlier verdicts know.
         joint: the joint fit.
+        statistical: effects that were detected by their statistics.
         claimed: names of the hypotheses that are part of the verdict.
     """
     model = joint.chains.model
@@ -113,6 +126,13 @@ def changes(known: Known, joint: JointFit, claimed: Container[str]) -> Since:
         sd = math.hypot(sd, _from_form(joint, name))
         changed.append(Change(name, limits(name).unit, None if new else _interval(before, known.sd(name)),
                               _interval(after, joint.sd[name]), _interval(after - before, sd), material))
+    for s in statistical.found:
+        size = f"{s.hypothesis.effect}.{CATALOGUE[s.hypothesis.effect].size}"
+        before, after, sd = neutral(model, size), s.fit.values[size], float(np.hypot(known.sd(size), s.fit.sd[size]))
+        if s.hypothesis.effect not in model.effects or abs(after - before) > SURE * sd:
+            was = _interval(before, known.sd(size)) if s.hypothesis.effect in model.effects else None
+            changed.append(Change(size, limits(size).unit, was, _interval(after, s.fit.sd[size]),
+                                  _interval(after - before, sd), s.hypothesis.name in claimed))
     same, open_ = {}, []
     for name in known.names:
         if name in compared.names and name not in found:

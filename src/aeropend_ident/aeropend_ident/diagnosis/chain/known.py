@@ -21,6 +21,10 @@ LEAST_SD = 1e-6
 """Least standard deviation over the value (choice: below any that matters; it keeps standard units finite)."""
 
 
+RANDOM = ("gust", "speed_spikes")
+"""Effects that are detected by their statistics: no fit of readings has their parameters."""
+
+
 @dataclass(frozen=True)
 class Known:
     """Estimates of a rig.
@@ -53,7 +57,8 @@ class Known:
         """
         deviation = np.sqrt(np.diag(self.covariance))
         least = LEAST_SD * np.abs(self.values)
-        mine = [j for j, n in enumerate(self.names) if stage_of(n) in stages and max(deviation[j], least[j]) > 0.0]
+        mine = [j for j, n in enumerate(self.names)
+                if stage_of(n) in stages and key(n).owner not in RANDOM and max(deviation[j], least[j]) > 0.0]
         out = []
         for j in mine:
             name, value, sd = self.names[j], float(self.values[j]), max(float(deviation[j]), float(least[j]))

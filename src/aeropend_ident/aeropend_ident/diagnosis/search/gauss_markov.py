@@ -11,6 +11,7 @@ H. Rauch, F. Tung and C. Striebel, AIAA Journal 3, 1965 (smoother).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +39,13 @@ NOT_KEPT = np.empty((0, 18))
 
 FOLDS = 10
 """Stretches of time in the cross-validation, each predicted from the others (convention: ten folds)."""
+
+
+CURVATURE_STEP = 0.05
+"""Step of the finite differences of the cost, in the logarithm of a parameter (choice: well above rounding)."""
+
+MOST_CORRELATED = 0.99
+"""Largest correlation of the two parameters (choice: a flat valley stays invertible)."""
 
 
 @dataclass(frozen=True)
@@ -179,12 +187,7 @@ def fit_gust(residual: Array, theta: Array, gravity: float, damping: float, nois
                          options={"xatol": 0.02, "fatol": 0.1, "maxfev": 60}) for tau in (0.05, 0.5)),
                key=lambda solution: solution.fun)
     z = np.array([best.x[0], min(max(best.x[1], shortest), longest)])
-    width = []
-    for j in range(2):
-        step = np.zeros(2)
-        step[j] = 0.05
-        curvature = (cost(z + step) - 2.0 * best.fun + cost(z - step)) / 0.05**2
-        width.append(1.0 / math.sqrt(max(curvature, 1e-6)))
+    width = _widths(cost, z)
     known = r[np.isfinite(r)]
     white = max(float(np.mean(known**2)), sd**2)
     without = -0.5 * len(known) * (math.log(white) + float(np.mean(known**2)) / white)
@@ -196,6 +199,16 @@ def fit_gust(residual: Array, theta: Array, gravity: float, damping: float, nois
     resolved = z[1] - Z95 * width[1] > math.log(h) and z[1] + Z95 * width[1] < longest
     return Gust(math.exp(z[0]), math.exp(z[1]), width[0], width[1], -best.fun, -best.fun - without, torque.copy(),
                 index, kurtosis, bool(resolved))
+
+
+def _widths(cost: Callable[[Array], float], z: Array) -> Array:
+    """Standard deviations (2,) of the parameters from the curvature of the cost; the two are correlated."""
+    s, t = np.diag([CURVATURE_STEP, CURVATURE_STEP])
+    mixed = 0.25 * (cost(z + s + t) - cost(z + s - t) - cost(z - s + t) + cost(z - s - t))
+    own = [max(cost(z + x) - 2.0 * cost(z) + cost(z - x), 1e-6) for x in (s, t)]
+    mixed = min(max(mixed, -MOST_CORRELATED * math.sqrt(own[0] * own[1])), MOST_CORRELATED * math.sqrt(own[0] * own[1]))
+    curvature = np.array([[own[0], mixed], [mixed, own[1]]]) / CURVATURE_STEP**2
+    return np.asarray(np.sqrt(np.diag(np.linalg.inv(curvature))))
 
 
 def gauss_markov(shape: tuple[int, int], tau: float, period: float, rng: np.random.Generator) -> Array:

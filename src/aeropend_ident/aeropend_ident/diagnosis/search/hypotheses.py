@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aeropend_ident.diagnosis.chain.chain import DELAY, CutChains
-from aeropend_ident.diagnosis.chain.known import Known
+from aeropend_ident.diagnosis.chain.known import RANDOM, Known
 from aeropend_ident.diagnosis.chain.priors import (
     CHOSEN,
     FINDINGS,
@@ -135,7 +135,7 @@ def _changes(model: Model, known: Known) -> Iterable[Hypothesis]:
         if all(name in numbers for name in names):
             yield Hypothesis(PARAMETER_MISMATCH, names[0], (tuple(numbers[name] for name in names),))
     for id_, parameters in model.effects.items():
-        if id_ in CATALOGUE and f"{id_}.{CATALOGUE[id_].size}" in known.names:
+        if id_ in CATALOGUE and id_ not in RANDOM and f"{id_}.{CATALOGUE[id_].size}" in known.names:
             size = CATALOGUE[id_].parameters[CATALOGUE[id_].size]
             was = parameters[CATALOGUE[id_].size]
             wide = max(abs(was - size.neutral), abs(usual_size(id_, model) - size.neutral))
