@@ -7,7 +7,7 @@
 
 right: time, angle and command are those of the rig. asked: import does not use what it is not sure of. refused: it
 cannot read the file. wrong: it made a recording that is not that of the rig. Of some tables nobody could know all
-without asking (the supply of a command in volts, the counts of a turn): the share of right answers is that of the
+without asking (the counts of a turn, the rate of rows without a time): the share of right answers is that of the
 others. Seeds below 1000 are for development.
 """
 
@@ -71,6 +71,8 @@ def same(bag: Path, truth: Truth) -> bool:
     off = got.theta[seen] - truth.theta[near][seen]
     if (np.abs(off - np.median(off)) > ANGLE_OFF).mean() > 1.0 - ROWS:
         return False
+    if truth.volts is not None and "v_a" in got.channels:
+        return bool((np.abs(got.v_a - truth.volts[near])[seen] > 1e-3).mean() <= 1.0 - ROWS)
     has_duty = "duty" in got.channels or len(got.command) > 0
     if truth.duty is None or not has_duty:
         return truth.duty is None and not has_duty

@@ -98,12 +98,14 @@ class Truth:
 
     Attributes:
         asks: why nobody could know without asking; "" if it can be known.
+        volts: [V] (N,) of a command in volts, which is as good as the duty.
     """
 
     t: Array
     theta: Array
     duty: Array | None
     asks: str = ""
+    volts: Array | None = None
 
 
 @dataclass
@@ -135,9 +137,11 @@ def draw(rng: np.random.Generator) -> Drawn:
     elif names == "none":
         for column in columns:
             column.name = column.unit = ""
-    if not said:
+    if not said or names == "none":
         for column in columns:
             column.unit = ""
+        if made.truth.volts is not None:
+            made.truth.asks = made.truth.asks or "that the command is in volts is in no file"
     made.habits["units"] = "written" if said and names != "none" else "not written"
     made.columns = columns
     return made
@@ -257,7 +261,7 @@ def _command(rng: np.random.Generator, run: rigs.Run, made: Drawn, names: str) -
     if kind in ("1000", "1023", "4095") and x.max() < high:
         made.truth.asks = made.truth.asks or "the counts of full duty are in no file"
     if kind == "V":
-        made.truth.asks = made.truth.asks or "the supply is in no file"
+        made.truth.volts = x
     made.truth.duty = np.clip((x - low) / (high - low), 0.0, 1.0)
     return Cells("u", name, x, digits, unit)
 

@@ -78,7 +78,7 @@ def test_a_proposal_for_columns_without_names(tmp_path, capsys):
      "check --duty pwm:counts:255"),
     ("t,angle,pwm\n" + lines(TIME, ANGLE, DUTY), "but column 2 \"angle\" does not follow it"),
     ("t,pwm,angle\n" + lines(LONG, DRIVEN, PUSH), "but it does not move as an arm"),
-    ("t,angle,u [V]\n" + lines(LONG, DRIVEN, PUSH / 10), "of which supply? add --supply 12V"),
+    ("t,angle,v\n" + lines(LONG, DRIVEN, PUSH / 10), "of which supply? add --supply 12V"),
     ("t,angle,u\n" + lines(LONG, DRIVEN, np.where(PUSH > 0.0, PUSH, -20.0)), "add --both-ways clip"),
     ("k,angle,u\n" + lines(np.arange(len(LONG)), DRIVEN, PUSH), "a counter of rows, or ms?"),
 ])  # fmt: skip
@@ -89,6 +89,16 @@ def test_what_is_not_obvious_is_not_accepted(tmp_path, capsys, text, says):
     assert "check first what is not clear" in err
     assert err.count("\n") == 1
     assert not (tmp_path / "bag").exists()
+
+
+@pytest.mark.promise("Tables", "A command in volts is a share of the supply, or the voltage itself")
+def test_a_command_in_volts_is_the_voltage_where_the_supply_is_not_known(tmp_path):
+    path = put(tmp_path, "t,angle,u [V]\n" + lines(LONG, DRIVEN, PUSH / 10))
+    recording = imported(tmp_path, path, "--accept")
+    np.testing.assert_allclose(recording.v_a, PUSH / 10, atol=1e-5)
+    assert "duty" not in recording.channels
+    recording = imported(tmp_path, path, "--accept", "--supply", "10V")
+    np.testing.assert_allclose(recording.duty, PUSH / 100, atol=1e-5)
 
 
 def test_a_table_of_steady_states_is_no_recording(tmp_path, capsys):

@@ -71,7 +71,7 @@ def test_an_encoder_that_passes_the_end_of_its_turn(tmp_path, capsys):
     assert "passes the end of its turn" in capsys.readouterr().out
 
 
-@pytest.mark.promise("Tables", "A command in volts is a share of the supply")
+@pytest.mark.promise("Tables", "A command in volts is a share of the supply, or the voltage itself")
 def test_a_command_in_volts(tmp_path, capsys):
     path = put(tmp_path, "t,x,u [V]\n" + lines(TIME, ANGLE, DUTY / 100 * 12.0))
     assert "needs the voltage of the supply" in refused(capsys, path, tmp_path / "bag", *MAPPED, "--duty", "u")

@@ -288,7 +288,7 @@ def propose(table: Table, found: Sequence[Guess], chosen: dict[str, str], given:
         if one.quantity and not one.sure and not (one.quantity == "time" and given.rate is not None):
             check = "check" if one.quantity in open_ else "perhaps"
             print(printable(f"  {check} --{one.quantity} {shlex.quote(option(table, k, one))} ({one.why})"))
-    off = "." if "duty" in all_ or given.motor_off else ",\n--motor-off if the motor was always off."
+    off = "." if all_.keys() & {"duty", "voltage"} or given.motor_off else ",\n--motor-off if the motor was always off."
     print("\nAdd --zero READING if --theta is not 0 when the arm hangs, --flip if it decreases when the arm is "
           f"lifted{off}")
     if timeless:

@@ -320,6 +320,10 @@ def _arm(table: Table, seen: list[_Seen], found: list[Guess], clock: int | None,
     doubt = second or ("" if rival is None else "or no command?" if rival < 0 else f"or column {table.label(rival)}?")
     unit, scale, clear = _command_scale(seen[b], given)
     how = "" if gains[a, b] < SOME else f"column {table.label(a)} follows it"
+    volts = bool(_unit(seen[b].column, "voltage")) or seen[b].meaning == Meaning("voltage", STRONG)
+    if volts and not given.supply and not doubt and np.nanmin(seen[b].column.values) >= 0.0:
+        found[b] = Guess("voltage", unit, _reason(seen[b], "voltage", how, "the input, in V"), True)
+        return
     found[b] = Guess("duty", unit, _reason(seen[b], "duty", how, scale, doubt), clear and not doubt)
 
 
@@ -438,7 +442,7 @@ def _reason(one: _Seen, quantity: str, *more: str) -> str:
     said = SAID[about_angle(one.traits)]
     if quantity == "theta" and said != SAID["smooth"]:
         said = ""
-    if quantity == "duty" and not one.traits.holds:
+    if quantity != "theta" and not one.traits.holds:
         said = ""
     return "; ".join(x for x in (name or unit, said, *more) if x)
 
@@ -459,11 +463,15 @@ def _angle_scale(one: _Seen) -> scales.Scale:
     return unit, why, sure
 
 
+def _is_voltage(one: _Seen) -> bool:
+    return one.meaning.quantity == "voltage" or bool(_unit(one.column, "voltage"))
+
+
 def _command_scale(one: _Seen, given: Given) -> scales.Scale:
     x = one.column.values[np.isfinite(one.column.values)]
     low, top = float(x.min()), float(x.max())
     said = _unit(one.column, "duty")
-    if one.meaning.quantity == "voltage" or _unit(one.column, "voltage"):
+    if _is_voltage(one):
         unit, why, sure = "" if _unit(one.column, "voltage") else "V", "in V", given.supply
         why += "" if sure else f", {low:.4g} to {top:.4g}: of which supply? add --supply 12V"
     elif said:
