@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.signal import lfilter
 
 from aeropend_ident.bags import recording
 from aeropend_ident.bags.recording import Recording, RecordingError
@@ -16,6 +15,7 @@ from aeropend_ident.identification import dataset
 from aeropend_ident.identification.excitation_quality import quality
 from aeropend_ident.signals.from_bag import as_signals
 from aeropend_ident.signals.signals import STILL
+from aeropend_ident.signals.smoothing import lag
 from aeropend_sim.model.parameters import Model
 from aeropend_sim.wording import counted
 
@@ -144,9 +144,7 @@ def following(read: Recording) -> float:
     theta, duty = read.theta[known], read.duty[known]
     if len(theta) < 2 or np.ptp(duty) < STILL or np.ptp(theta) == 0.0:
         return math.nan
-    keep = math.exp(-read.period / LAG)
-    lagged, _ = lfilter([1.0 - keep], [1.0, -keep], duty, zi=[keep * duty[0]])
-    return float(np.corrcoef(lagged, theta)[0, 1])
+    return float(np.corrcoef(lag(duty, LAG, read.period), theta)[0, 1])
 
 
 def _use(path: str, read: Recording, model: Model) -> Iterator[Check]:

@@ -48,26 +48,28 @@ def block_mean(x: Array, width: int) -> Array:
     return np.where(count > 0, np.nansum(rows, axis=1) / np.maximum(count, 1), np.nan)
 
 
-def lag(x: Array, tau: float, period: float) -> Array:
+def lag(x: Array, tau: float, period: float, fall: float = 1.0) -> Array:
     """First-order lag that starts in its steady state.
 
     Args:
         x: (N,) series without missing values.
         tau: [s] time constant.
         period: [s] between samples.
+        fall: time constant while the series falls, over that while it rises.
 
     Returns:
         (N,) filtered series.
     """
-    return _lag(np.ascontiguousarray(x), math.exp(-period / tau))
+    return _lag(np.ascontiguousarray(x), math.exp(-period / tau), math.exp(-period / (fall * tau)))
 
 
 @njit(nogil=True)
-def _lag(x: Array, keep: float) -> Array:
+def _lag(x: Array, rising: float, falling: float) -> Array:
     # scipy.signal.lfilter gives the same up to rounding; its import takes longer than all calls of a diagnosis
     out = np.empty_like(x)
     s = x[0]
     for k in range(len(x)):
+        keep = rising if x[k] > s else falling
         s = keep * s + (1.0 - keep) * x[k]
         out[k] = s
     return out

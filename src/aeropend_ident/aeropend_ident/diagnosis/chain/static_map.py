@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from aeropend_ident.diagnosis.policy import GOOD_ENOUGH
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals
+from aeropend_ident.signals.smoothing import lag
 from aeropend_sim.wording import times
 
 Array = NDArray[np.float64]
@@ -41,9 +41,8 @@ def mean_squares(signals: Signals) -> tuple[float, float]:
     y = signals.theta[:n][known]
     scale = signals.sigma["theta"] ** 2
     least = constant = float(np.var(y))
-    for lag in LAGS:
-        keep = np.exp(-signals.period / lag)
-        u = lfilter([1.0 - keep], [1.0, -keep], signals.duty[:n], zi=[keep * signals.duty[0]])[0][known]
+    for tau in LAGS:
+        u = lag(signals.duty[:n], tau, signals.period)[known]
         columns = np.vander(u / max(float(np.max(np.abs(u))), 1e-12), ORDER + 1)
         solution, *_ = np.linalg.lstsq(columns, y, rcond=1e-10)
         least = min(least, float(np.mean((y - columns @ solution) ** 2)))

@@ -15,9 +15,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from aeropend_ident.signals import smoothing
 from aeropend_ident.signals.signals import Signals
 from aeropend_ident.signals.smoothing import block_mean
-from aeropend_sim.compiled import njit
 from aeropend_sim.model import actuator, dynamics
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import Model
@@ -141,19 +141,7 @@ def unit_lift(model: Model, s: Signals) -> Array:
     pivot = dynamics.THRUST_PIVOT_SPEED
     u = pivot**2 * (np.maximum(out[1], 0.0) / pivot) ** model.effect("thrust_exponent", "n")
     tau = model.effect("thrust_lag", "tau")
-    return _lagged(u, s.period, tau, tau * model.effect("thrust_lag", "fall")) if tau > 0.0 else u
-
-
-@njit()
-def _lagged(u: Array, period: float, rise: float, fall: float) -> Array:
-    """A series (N,) behind a first-order lag with time constants for rise and fall [s]."""
-    up, down = math.exp(-period / rise), math.exp(-period / fall)
-    out = np.empty_like(u)
-    now = u[0]
-    for k in range(len(u)):
-        now = u[k] + (up if u[k] > now else down) * (now - u[k])
-        out[k] = now
-    return out
+    return smoothing.lag(u, tau, s.period, model.effect("thrust_lag", "fall")) if tau > 0.0 else u
 
 
 class WeakForm:
