@@ -23,6 +23,7 @@ import numpy as np
 from aeropend_ident.bags import recording
 from aeropend_ident.signals.from_bag import from_recording
 from aeropend_ident.testing import bags
+from aeropend_sim.model.effects import RANDOM
 from aeropend_sim.model.parameters import load
 from evaluation.blind import cases, circumstances, folder, limit, page, pairs, peers, plant, report, score, uncalibrated
 
@@ -90,7 +91,7 @@ def limits(out: Path, labels: list[dict[str, Any]], jobs: int) -> dict[str, Any]
                                           signals.sigma)
 
     rows = [c for c in labels if c["kind"] == "single" and c["form"] == "table" and not c["closed_loop"]
-            and c["effects"][0]["effect"] not in limit.RANDOM]
+            and c["effects"][0]["effect"] not in RANDOM]
     return dict(folder.each("finding the limit", rows, one, jobs))
 
 

@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 
 from aeropend_ident.signals.pulses import mean_speed
 from aeropend_sim.model import dynamics, sensing
-from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH, EffectParameter
+from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH, RANDOM, EffectParameter
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
 
 Array = NDArray[np.float64]
@@ -32,9 +32,6 @@ OFF = 0.05
 
 STRAYED = 0.5
 """Share by which the number may be off that a rival `parameter_mismatch` blames."""
-
-RANDOM = ("gust", "speed_spikes")
-"""Effects of chance: their readings are no curve that a distance could be taken from."""
 
 THIN = 6
 """Every so many samples are compared, and weighed as so many: without noise the readings are smooth."""

@@ -28,9 +28,9 @@ from aeropend_ident.diagnosis import free_run_gap
 from aeropend_ident.diagnosis.chain.values import PLACE_OF_PARAMETER
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import actuator
-from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
+from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH, RANDOM
 from aeropend_sim.model.parameters import Model, load
-from evaluation.blind.limit import OFF, RANDOM, Coordinate, Descent, derivative, descend, numbers_within, starts_of
+from evaluation.blind.limit import OFF, Coordinate, Descent, derivative, descend, numbers_within, starts_of
 
 Array = NDArray[np.float64]
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from aeropend_control.laws.registry import LAWS
 from aeropend_sim.errors import UserError
+from aeropend_sim.model.effects import RANDOM
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 from aeropend_sim.model.rig import Rig
 
@@ -34,9 +35,6 @@ HIGHEST = 40.0
 
 AMPLITUDE = 2e-4
 """Amplitude of each sine, as a duty (choice; small, so that the loop stays linear)."""
-
-RANDOM = ("gust", "speed_spikes")
-"""Effects that are random; the loop gain is measured without them."""
 
 EXACT = ("angle_lsb", "angle_noise", "current_lsb", "current_noise", "voltage_lsb", "voltage_noise", "speed_tick",
          "speed_noise")

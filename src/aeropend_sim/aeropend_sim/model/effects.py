@@ -135,6 +135,9 @@ _ENTRIES = (
 CATALOGUE: dict[str, Effect] = {entry.id: entry for entry in _ENTRIES}
 """All effects except `parameter_mismatch`, by id, in the order of the chain."""
 
+RANDOM = frozenset({"gust", "speed_spikes"})
+"""Effects of chance: no model predicts their readings, and no fit of readings has their parameters."""
+
 SPIKE_FACTOR = (1.3, 4.0)
 """Range of the false speed over the true one, uniform: a false capture period is too short. Convention."""
 

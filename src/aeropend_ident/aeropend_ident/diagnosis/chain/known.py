@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.values import FILTER, PLACE_OF_PARAMETER, STAGES
 from aeropend_ident.estimation.parameter import Parameter, key
-from aeropend_sim.model.effects import CATALOGUE, EffectParameter
+from aeropend_sim.model.effects import CATALOGUE, RANDOM, EffectParameter
 from aeropend_sim.model.parameters import PARAMETERS
 from aeropend_sim.model.parameters import Parameter as ModelParameter
 
@@ -19,10 +19,6 @@ Array = NDArray[np.float64]
 
 LEAST_SD = 1e-6
 """Least standard deviation over the value (choice: below any that matters; it keeps standard units finite)."""
-
-
-RANDOM = ("gust", "speed_spikes")
-"""Effects that are detected by their statistics: no fit of readings has their parameters."""
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,10 @@ from aeropend_ident.diagnosis.report import gap
 from aeropend_ident.diagnosis.report.candidates import CandidateRow
 from aeropend_ident.diagnosis.report.number_format import percent, quantity
 from aeropend_ident.diagnosis.report.parameters import OFF, ParameterRowText
-from aeropend_ident.diagnosis.report.sentence import CLOSED, RANDOM
+from aeropend_ident.diagnosis.report.sentence import CLOSED
 from aeropend_ident.diagnosis.report.variables import VARIABLES
 from aeropend_ident.signals.signals import Signals
+from aeropend_sim.model.effects import RANDOM
 
 Array = NDArray[np.float64]
 

@@ -10,11 +10,8 @@ from typing import Literal
 from aeropend_ident.diagnosis.document import CANNOT_TELL, ClosedGap, DiagnosisDocument, Since
 from aeropend_ident.diagnosis.policy import GOOD_ENOUGH
 from aeropend_ident.diagnosis.report.number_format import percent, quantity
-from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
+from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH, RANDOM
 from aeropend_sim.model.parameters import PARAMETERS
-
-RANDOM = {"gust", "speed_spikes"}
-"""Effects that are random: no model predicts them, so their gap stays open."""
 
 CLOSED = 0.9
 """Share of the gap that an effect of the right form closes at least (choice)."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aeropend_ident.diagnosis.chain.chain import DELAY, CutChains
-from aeropend_ident.diagnosis.chain.known import RANDOM, Known
+from aeropend_ident.diagnosis.chain.known import Known
 from aeropend_ident.diagnosis.chain.priors import (
     CHOSEN,
     FINDINGS,
@@ -22,7 +22,7 @@ from aeropend_ident.diagnosis.chain.priors import (
 from aeropend_ident.diagnosis.chain.values import PLACE_OF_PARAMETER, STAGES
 from aeropend_ident.diagnosis.policy import angle_only
 from aeropend_ident.estimation.parameter import Parameter, key
-from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
+from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH, RANDOM
 from aeropend_sim.model.parameters import PARAMETERS, Model
 
 MISMATCH_SD = 0.3
