@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.known import Known
-from aeropend_ident.diagnosis.chain.values import with_values
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.document import Since
 from aeropend_ident.signals.signals import Signals, from_arrays
@@ -177,8 +176,7 @@ def judge(pair: Pair, jobs: int = 1) -> Judged:
     e = monday.conclusions.estimates
     assert e is not None
     known = Known(e.names, np.array(e.values), np.array(e.covariance), ("before",))
-    model = with_values(monday.augmented, dict(zip(e.names, e.values, strict=True)))
-    found = diagnose(model, [pair.after], jobs, known=known).conclusions.since
+    found = diagnose(monday.augmented, [pair.after], jobs, known=known).conclusions.since
     assert found is not None
     return _judged(pair, found)
 

@@ -12,6 +12,7 @@ from aeropend_ident.diagnosis import since
 from aeropend_ident.diagnosis.chain.known import Known, pooled
 from aeropend_ident.diagnosis.diagnosis import Diagnosis, diagnose
 from aeropend_ident.diagnosis.document import DocumentError
+from aeropend_ident.diagnosis.report import changes
 from aeropend_ident.diagnosis.results import Results, document
 from aeropend_ident.estimation.map_fit import fit, prior_information
 from aeropend_ident.estimation.parameter import Parameter
@@ -69,7 +70,7 @@ def test_friction_that_grew_is_named(monday):
     assert change.before.low < FRICTION < change.before.high
     assert change.change.low < FRICTION < change.change.high
     assert found.which.effects == ("coulomb_friction",)
-    assert since.lines(found.since)[0].startswith("  changed: coulomb_friction.accel 0.4")
+    assert changes.lines(found.since)[0].startswith("  changed: coulomb_friction.accel 0.4")
 
 
 @pytest.mark.promise("Verdict", "A mass on the arm is named by weight, lever and damping over its inertia")

@@ -13,7 +13,7 @@ from aeropend_ident.diagnosis import experiment_design
 from aeropend_ident.diagnosis.chain import driven_rig
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import CHOSEN, OF_THE_ARM, UNCALIBRATED_SD, ZERO, basis, model_parameters
-from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, FILTER, STAGES, neutral, of_rig, with_values
+from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, FILTER, STAGES, limits, neutral, of_rig, with_values
 from aeropend_ident.diagnosis.document import (
     Candidate,
     HangingAngle,
@@ -32,7 +32,6 @@ from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.signals import Signals
 from aeropend_ident.signals.statistics import Z95
-from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import MODEL_NAMES, PARAMETERS, Model
 
@@ -65,7 +64,7 @@ def parameter_rows(chains: CutChains, joint: JointFit) -> dict[str, ParameterRow
     """
     nominal, values, sd = chains.model.model, joint.values, joint.sd
     if chains.policy.calibrated:
-        return {n: _row(neutral(chains.model, n), _interval(values[n], sd[n])) for n in (*MODEL_NAMES, FILTER)
+        return {n: _row(neutral(chains.model, n), interval(values[n], sd[n])) for n in (*MODEL_NAMES, FILTER)
                 if n in values}
     fitted = {p.name: p for stage in STAGES for p in model_parameters(chains, stage)}
     alone = angle_only(chains.recordings)
@@ -82,7 +81,7 @@ def parameter_rows(chains: CutChains, joint: JointFit) -> dict[str, ParameterRow
             reach = math.exp(Z95 * spread / value)
             between = Interval(value, max(value / reach, limits.low), min(value * reach, limits.high))
         else:
-            between = _interval(value, spread, p.low, p.high)
+            between = interval(value, spread, p.low, p.high)
         row = _row(nominal[n], between, known and spread < DETERMINED * prior)
         own = _over_recordings(n, values, sd) if known else None
         rows[n] = row if own is None else replace(row, value=own.mean.value, low=own.mean.low, high=own.mean.high,
@@ -112,8 +111,8 @@ def _over_recordings(name: str, of_all: Mapping[str, float], sd_of_all: Mapping[
     spread = math.sqrt(max(float(np.var(values, ddof=1)) - float(np.mean(np.square(sd))), 0.0))
     mean, unsure = float(np.mean(values)), math.sqrt(float(np.var(values, ddof=1)) / len(values))
     unsure = max(unsure, math.sqrt(float(np.sum(np.square(sd)))) / len(sd))
-    return _OverRecordings(_interval(mean, unsure),
-                           tuple(_interval(v, s) for v, s in zip(values, sd, strict=True)), spread)
+    return _OverRecordings(interval(mean, unsure),
+                           tuple(interval(v, s) for v, s in zip(values, sd, strict=True)), spread)
 
 
 def identified_model(chains: CutChains, joint: JointFit, rows: Mapping[str, ParameterRow]) -> Identified:
@@ -129,7 +128,7 @@ def identified_model(chains: CutChains, joint: JointFit, rows: Mapping[str, Para
     if "k3" in values and angle_only(recordings):
         lift = driven_rig.lift(with_values(chains.model, chains.values_of(values, 0)), recordings)
     if ZERO in values:
-        one, own = _interval(values[ZERO], joint.sd[ZERO]), _over_recordings(ZERO, values, joint.sd)
+        one, own = interval(values[ZERO], joint.sd[ZERO]), _over_recordings(ZERO, values, joint.sd)
         mean = one if own is None else own.mean
         hangs = HangingAngle(mean.value, mean.low, mean.high, own.runs if own else None,
                              own.run_to_run if own else None)
@@ -168,7 +167,7 @@ def candidates(joint: JointFit, statistical: Statistical, held_out: HeldOut, gap
                     continue
                 source, spread = (joint.values, joint.sd) if mine else (r.fit.values, r.fit.sd)
                 whole = {**joint.values, **off, **r.fit.values}
-                estimates = {key(p.name).name: _interval(source[p.name], spread[p.name], p.low, p.high) for p in h.own}
+                estimates = {key(p.name).name: interval(source[p.name], spread[p.name], p.low, p.high) for p in h.own}
                 after = gap_after if mine else _finite(held_out.gap_of(whole).total)
                 since, until = (onset.since, onset.until) if onset and mine else (None, None)
                 rows[h.name] = Candidate(h.effect, h.place, r.probability, estimates, h.name in claimed, after,
@@ -176,7 +175,7 @@ def candidates(joint: JointFit, statistical: Statistical, held_out: HeldOut, gap
                                          None if mine else winner)
     for extra in statistical.found:
         h = extra.hypothesis
-        estimates = {key(n).name: _interval(v, extra.fit.sd[n], 0.0) for n, v in extra.fit.values.items()}
+        estimates = {key(n).name: interval(v, extra.fit.sd[n], 0.0) for n, v in extra.fit.values.items()}
         rows[h.name] = Candidate(h.effect, h.place, extra.probability, estimates, h.name in claimed, gap_after,
                                  share.get(h.name))
     return tuple(sorted(rows.values(), key=lambda row: -row.probability))
@@ -250,13 +249,14 @@ def next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[Ranked
 
 def _within_range(name: str, value: float, sd: float) -> Interval:
     """The estimate of a parameter of an effect; its interval ends where the range of the parameter does."""
-    p = CATALOGUE[key(name).owner].parameters[key(name).name]
-    return _interval(value, sd, p.low, p.high)
+    p = limits(name)
+    return interval(value, sd, p.low, p.high)
 
 
 def _finite(x: float) -> float | None:
     return x if math.isfinite(x) else None
 
 
-def _interval(value: float, sd: float, low: float = -math.inf, high: float = math.inf) -> Interval:
+def interval(value: float, sd: float, low: float = -math.inf, high: float = math.inf) -> Interval:
+    """An estimate with its 95 % interval, which ends where the range of the value does."""
     return Interval(value, max(value - Z95 * sd, low), min(value + Z95 * sd, high))

@@ -443,6 +443,21 @@ class Since:
     unchanged: Mapping[str, Interval]
     not_shown: tuple[str, ...]
 
+    @property
+    def named(self) -> str:
+        """The earlier verdicts in words."""
+        return " and ".join(self.verdicts)
+
+    @property
+    def claimed(self) -> list[str]:
+        """The parameters that are claimed to have changed."""
+        return [c.name for c in self.changes if c.claimed]
+
+    @property
+    def by_weight(self) -> list[Change]:
+        """The changes, what is claimed first."""
+        return sorted(self.changes, key=lambda c: not c.claimed)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Conclusions:

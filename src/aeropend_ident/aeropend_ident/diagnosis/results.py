@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from aeropend_ident.diagnosis import since
 from aeropend_ident.diagnosis.diagnosis import Diagnosis
 from aeropend_ident.diagnosis.document import (
     CANNOT_TELL,
@@ -26,7 +25,7 @@ from aeropend_ident.diagnosis.document import (
     to_json,
 )
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
-from aeropend_ident.diagnosis.report import page, sentence
+from aeropend_ident.diagnosis.report import changes, page, sentence
 from aeropend_ident.diagnosis.report.candidates import open_pairs, unit_of
 from aeropend_ident.diagnosis.report.number_format import fit_text, plain, plain_percent, plain_time
 from aeropend_ident.diagnosis.report.parameters import lift_text
@@ -125,7 +124,7 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
     why = "; ".join(which.unexplained)
     lines = []
     if document.since is not None and which.verdict not in ("unknown", CANNOT_TELL):
-        lines.append(since.verdict_line(document.since, document.where.place))
+        lines.append(changes.verdict_line(document.since, document.where.place))
     elif which.verdict == "none":
         lines.append(f"verdict: none. {_spaced(headline)}")
     elif which.verdict == CANNOT_TELL:
@@ -151,7 +150,7 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
     if document.identified is not None:
         lines.append(f"  {identified_line(document.identified, which.numbers, document.duration_s)}")
     if document.since is not None:
-        lines += since.lines(document.since)
+        lines += changes.lines(document.since)
     lines.append(gap_line("gap on held-out data", closure))
     if (angle := document.channels.get("theta")) is not None:
         lines.append(f"  fit of the angle in a free run: {fit_text(angle.fit_fitted)} on the fitted part, "

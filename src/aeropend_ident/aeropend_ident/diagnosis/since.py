@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from aeropend_ident.diagnosis import document
-from aeropend_ident.diagnosis.chain.known import Known, is_parameter, limits, pooled
-from aeropend_ident.diagnosis.chain.values import neutral, with_values
-from aeropend_ident.diagnosis.conclude import Statistical
-from aeropend_ident.diagnosis.document import Change, DiagnosisDocument, DocumentError, Estimates, Interval, Since
+from aeropend_ident.diagnosis.chain.known import Known, is_parameter, pooled
+from aeropend_ident.diagnosis.chain.values import limits, neutral, with_values
+from aeropend_ident.diagnosis.conclude import Statistical, interval
+from aeropend_ident.diagnosis.document import Change, DiagnosisDocument, DocumentError, Estimates, Since
 from aeropend_ident.diagnosis.joint_fit import SURE, WIDER, JointFit
 from aeropend_ident.estimation.parameter import key
-from aeropend_ident.signals.statistics import Z95
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import Model, load
 from aeropend_sim.untrusted import one_line
@@ -124,15 +123,15 @@ def changes(known: Known, joint: JointFit, statistical: Statistical, claimed: Co
         new = key(name).owner in CATALOGUE and key(name).owner not in model.effects
         _, sd = compared.change(name, found)
         sd = math.hypot(sd, _from_form(joint, name))
-        changed.append(Change(name, limits(name).unit, None if new else _interval(before, known.sd(name)),
-                              _interval(after, joint.sd[name]), _interval(after - before, sd), material))
+        changed.append(Change(name, limits(name).unit, None if new else interval(before, known.sd(name)),
+                              interval(after, joint.sd[name]), interval(after - before, sd), material))
     for s in statistical.found:
         size = f"{s.hypothesis.effect}.{CATALOGUE[s.hypothesis.effect].size}"
         before, after, sd = neutral(model, size), s.fit.values[size], float(np.hypot(known.sd(size), s.fit.sd[size]))
         if s.hypothesis.effect not in model.effects or abs(after - before) > SURE * sd:
-            was = _interval(before, known.sd(size)) if s.hypothesis.effect in model.effects else None
-            changed.append(Change(size, limits(size).unit, was, _interval(after, s.fit.sd[size]),
-                                  _interval(after - before, sd), s.hypothesis.name in claimed))
+            was = interval(before, known.sd(size)) if s.hypothesis.effect in model.effects else None
+            changed.append(Change(size, limits(size).unit, was, interval(after, s.fit.sd[size]),
+                                  interval(after - before, sd), s.hypothesis.name in claimed))
     same, open_ = {}, []
     for name in known.names:
         if name in compared.names and name not in found:
@@ -141,7 +140,7 @@ def changes(known: Known, joint: JointFit, statistical: Statistical, claimed: Co
             if sd > SHOWN * before or before == 0.0:
                 open_.append(name)
             else:
-                same[name] = _interval(off / before, sd / before)
+                same[name] = interval(off / before, sd / before)
     return Since(known.verdicts, tuple(changed), same, tuple(open_))
 
 
@@ -161,6 +160,8 @@ class _Compared:
         wide: (P,) standard deviation, in standard units, of a parameter that may have changed.
         data: (P, P) what the data alone say of them: information matrix.
         pull: (P,) gradient of the prior: what the data pull against.
+        deviation: (Q,) standard deviations of what is known.
+        before: (Q, Q) what the earlier verdicts say, in units of these: information matrix.
     """
 
     known: Known
@@ -169,6 +170,8 @@ class _Compared:
     wide: Array
     data: Array
     pull: Array
+    deviation: Array
+    before: Array
 
     @classmethod
     def of(cls, joint: JointFit, known: Known) -> _Compared:
@@ -177,8 +180,11 @@ class _Compared:
         z = np.array([parameters[n].to_standard(joint.values[n]) for n in names])
         unit = np.array([abs(parameters[n].slope(x)) for n, x in zip(names, z, strict=True)])
         values = np.abs([joint.values[n] for n in names])
+        deviation = np.array([max(known.sd(n), 1e-300) for n in known.names])
+        correlation = known.covariance / np.outer(deviation, deviation)
+        before = np.asarray(np.linalg.pinv(correlation, hermitian=True), dtype=np.float64)
         return cls(known, names, unit, np.maximum(FREE_SD * values / unit, 1.0),
-                   joint.fit.information(joint.fit.ess) - joint.fit.prior, joint.fit.prior @ z)
+                   joint.fit.information(joint.fit.ess) - joint.fit.prior, joint.fit.prior @ z, deviation, before)
 
     def change(self, name: str, free: Collection[str]) -> tuple[float, float]:
         """Change of a parameter and its standard deviation if some parameters, and no others, have changed.
@@ -191,63 +197,22 @@ class _Compared:
             free: those that may have changed, this one among them.
         """
         before, count = list(self.known.names), len(self.known.names)
-        deviation = np.array([max(self.known.sd(n), 1e-300) for n in before])
         after = [n for n in self.names if n not in before or n in free]
         at = np.array([count + after.index(n) if n in after else before.index(n) for n in self.names])
         own = [self.names.index(n) for n in after]
-        unit = np.r_[deviation, self.unit[own]]
+        unit = np.r_[self.deviation, self.unit[own]]
         scale = unit[at] / self.unit
         information = np.zeros((len(unit), len(unit)))
-        correlation = self.known.covariance / np.outer(deviation, deviation)
-        information[:count, :count] = np.linalg.pinv(correlation, hermitian=True)
+        information[:count, :count] = self.before
         information[np.ix_(at, at)] += self.data * np.outer(scale, scale)
         spread = np.where([n in before for n in after], self.wide[own], 1.0)
         information[range(count, len(unit)), range(count, len(unit))] += spread**-2.0
         difference = np.zeros(len(unit))
         difference[count + after.index(name)] = unit[count + after.index(name)]
-        off = 0.0
+        pull = 0.0
         if name in before:
             j = before.index(name)
             difference[j] = -unit[j]
-            pull = self.pull[self.names.index(name)] / self.unit[self.names.index(name)]
-            off = pull * float(difference @ np.linalg.solve(information, difference))
-        return off, WIDER * math.sqrt(max(float(difference @ np.linalg.solve(information, difference)), 0.0))
-
-
-def _interval(value: float, sd: float) -> Interval:
-    return Interval(value, value - Z95 * sd, value + Z95 * sd)
-
-
-def verdict_line(since: Since, place: str) -> str:
-    """The verdict for the terminal."""
-    named, changed = " and ".join(since.verdicts), [c.name for c in since.changes if c.claimed]
-    if not changed:
-        return f"verdict: nothing has changed since {named} that the recording shows"
-    return f"verdict: since {named}, this has changed: {', '.join(changed)} ({place})"
-
-
-def lines(since: Since) -> list[str]:
-    """What has changed, in lines for the terminal."""
-    changed = sorted(since.changes, key=lambda c: not c.claimed)
-    out = [f"  {'changed' if c.claimed else 'small change'}: {described(c)}" for c in changed]
-    same = [f"{name} (at most {_farthest(x)})" for name, x in since.unchanged.items()]
-    if same:
-        out.append(f"  not changed: {', '.join(same)}")
-    if since.not_shown:
-        out.append(f"  the recording does not show whether these have changed: {', '.join(since.not_shown)}")
-    return out
-
-
-def described(c: Change) -> str:
-    """A change in words: `coulomb_friction.accel 0.41 -> 0.83 rad/s² (+0.42, 0.39 to 0.45)`."""
-    unit = "" if c.unit == "-" else f" {c.unit}"
-    between = f"{c.change.value:+.3g}, {c.change.low:+.3g} to {c.change.high:+.3g}"
-    if c.before is None:
-        return f"{c.name} appeared: {c.after.value:.4g} ({c.after.low:.4g} to {c.after.high:.4g}){unit}"
-    share = f"{100.0 * c.change.value / c.before.value:+.1f} %; " if c.before.value else ""
-    return f"{c.name} {c.before.value:.4g} -> {c.after.value:.4g}{unit} ({share}{between})"
-
-
-def _farthest(change: Interval) -> str:
-    """The largest change within the interval, as a share of the value before."""
-    return f"{100.0 * max(abs(change.low), abs(change.high)):.2g} %"
+            pull = float(self.pull[self.names.index(name)] / self.unit[self.names.index(name)])
+        variance = float(difference @ np.linalg.solve(information, difference))
+        return pull * variance, WIDER * math.sqrt(max(variance, 0.0))

@@ -335,12 +335,12 @@ def prior_information(parameters: Sequence[Parameter]) -> Array:
 
     Two parameters are correlated if both state it: one that replaces another is not.
     """
-    stated = {(p.name, other): value for p in parameters for other, value in p.correlation}
+    at = {p.name: j for j, p in enumerate(parameters)}
+    stated = {(at[p.name], at[other]): value for p in parameters for other, value in p.correlation if other in at}
     correlations = np.eye(len(parameters))
-    for j, p in enumerate(parameters):
-        for k, q in enumerate(parameters[:j]):
-            if (p.name, q.name) in stated and (q.name, p.name) in stated:
-                correlations[j, k] = correlations[k, j] = stated[p.name, q.name]
+    for (j, k), value in stated.items():
+        if k < j and (k, j) in stated:
+            correlations[j, k] = correlations[k, j] = value
     return np.asarray(np.linalg.inv(correlations))
 
 

@@ -14,6 +14,9 @@ import numpy as np
 from aeropend_ident.tables.guess import time_of
 from aeropend_ident.tables.table import Column, Floats, Ints, Table, TableError
 
+Clock = tuple[int, float | None] | None
+"""The time of a table, as `time_of` gives it."""
+
 
 def join(tables: Sequence[Table]) -> Table:
     """Join the tables of several files.
@@ -30,8 +33,8 @@ def join(tables: Sequence[Table]) -> Table:
     rest = [(first, k, column) for k, column in enumerate(first.columns) if k != number]
     columns = [] if number is None else [first.columns[number]]
     for other in tables[1:]:
-        rows, how = _rows(first, other)
         theirs = time_of(other)
+        rows, how = _rows(first, clock, other, theirs)
         signals = [k for k in range(len(other.columns)) if theirs is None or k != theirs[0]]
         notes += [f"{other.path.name}: {note}" for note in (*other.notes, how)]
         rest += [(other, k, _taken(other.columns[k], rows)) for k in signals]
@@ -46,9 +49,8 @@ def join(tables: Sequence[Table]) -> Table:
     return Table(first.path, tuple(columns), first.lines, tuple(notes), first.lengths, first.bad, first.complaint)
 
 
-def _rows(first: Table, other: Table) -> tuple[Ints, str]:
+def _rows(first: Table, mine: Clock, other: Table, theirs: Clock) -> tuple[Ints, str]:
     """The row of the other table for each row of the first, -1 for none; and how they were found."""
-    mine, theirs = time_of(first), time_of(other)
     if mine is None or theirs is None:
         if len(first) != len(other):
             missing = first if mine is None else other

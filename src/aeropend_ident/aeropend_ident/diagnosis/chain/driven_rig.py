@@ -28,7 +28,7 @@ from aeropend_ident.diagnosis.chain.priors import (
     refines,
     usual_size,
 )
-from aeropend_ident.diagnosis.chain.values import FILTER, of_rig, with_values
+from aeropend_ident.diagnosis.chain.values import FILTER, absent_at, of_rig, with_values
 from aeropend_ident.diagnosis.chain.weak_start import WeakForm, downsampled, likeliest
 from aeropend_ident.diagnosis.document import Lift
 from aeropend_ident.diagnosis.policy import UNCALIBRATED
@@ -145,8 +145,9 @@ def fit_driven_rig(model: Model, recordings: Sequence[Signals]) -> DrivenRig:
     """
     units = units_of(model, recordings)
     scaled = [downsampled(units.of(s), dynamics.LONGEST_STEP) for s in recordings]
-    full, plain = _searched(units.model(model), scaled, keep=model.effects)
-    chosen = _refined(units.model(model), _chosen(full, scaled, model.effects), scaled, model.effects)
+    begun = units.model(model)
+    full, plain = _searched(begun, scaled, keep=model.effects)
+    chosen = _refined(begun, _chosen(full, scaled, model.effects), scaled, model.effects)
     found = units.model(chosen.model, back=True)
     f = fit_own(found, recordings)
     return DrivenRig(with_values(found, of_rig(f.values)), _rescaled(units.model(plain, back=True), found),
@@ -244,17 +245,14 @@ def _over_growing_horizons(begun: list[Model], recordings: Sequence[Signals]) ->
     return begun[0]
 
 
-def _usual(name: str, m: Model) -> tuple[float, float]:
-    """The value at which a term is absent, and by how much it usually differs from it."""
-    k = key(name)
-    p = CATALOGUE[k.owner].parameters[k.name]
-    return p.neutral, 1.0 if p.refines else usual_size(k.owner, m) - p.neutral
+def _usual(name: str, m: Model) -> float:
+    """By how much a term usually differs from the value at which it is absent."""
+    return 1.0 if refines(name) else usual_size(key(name).owner, m) - absent_at(name)
 
 
 def _first_size(name: str, m: Model) -> float:
     """The size of a term from which a fit with every term starts."""
-    absent, usual = _usual(name, m)
-    return absent + FIRST_SIZE * usual
+    return absent_at(name) + FIRST_SIZE * _usual(name, m)
 
 
 def _with_terms(m: Model, names: Sequence[str]) -> Model:
@@ -282,8 +280,8 @@ def _refined(model: Model, best: Candidate, recordings: Sequence[Signals], keep:
 
 def _absent(c: Candidate, name: str) -> bool:
     """Whether a term has ended at the size at which it is absent."""
-    absent, usual = _usual(name, c.model)
-    return abs(c.model.effect(key(name).owner, key(name).name) - absent) < NOTHING * abs(usual)
+    size = c.model.effect(key(name).owner, key(name).name)
+    return abs(size - absent_at(name)) < NOTHING * abs(_usual(name, c.model))
 
 
 def _chosen(best: Candidate, recordings: Sequence[Signals], keep: Collection[str]) -> Candidate:
@@ -317,10 +315,9 @@ def _delay_or_lag(best: Candidate, recordings: Sequence[Signals], keep: Collecti
 
 def _without(c: Candidate, recordings: Sequence[Signals], name: str) -> Candidate:
     k = key(name)
-    absent, _ = _usual(name, c.model)
     effects = {e: p for e, p in c.model.effects.items() if e != k.owner or CATALOGUE[e].size != k.name}
     if k.owner in effects:
-        effects[k.owner] = {**effects[k.owner], k.name: absent}
+        effects[k.owner] = {**effects[k.owner], k.name: absent_at(name)}
     return _candidate(c.model.with_effects(effects), recordings)
 
 

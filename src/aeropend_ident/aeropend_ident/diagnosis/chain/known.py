@@ -9,11 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis.chain.values import FILTER, PLACE_OF_PARAMETER, STAGES
+from aeropend_ident.diagnosis.chain.values import FILTER, PLACE_OF_PARAMETER, STAGES, limits
 from aeropend_ident.estimation.parameter import Parameter, key
-from aeropend_sim.model.effects import CATALOGUE, RANDOM, EffectParameter
-from aeropend_sim.model.parameters import PARAMETERS
-from aeropend_sim.model.parameters import Parameter as ModelParameter
+from aeropend_sim.model.effects import CATALOGUE, RANDOM
 
 Array = NDArray[np.float64]
 
@@ -39,10 +37,8 @@ class Known:
 
     def sd(self, name: str) -> float:
         """Standard deviation of an estimate; 0 if it is not known."""
-        return float(np.sqrt(self.covariance[j, j])) if (j := self._at(name)) is not None else 0.0
-
-    def _at(self, name: str) -> int | None:
-        return self.names.index(name) if name in self.names else None
+        j = self.names.index(name) if name in self.names else None
+        return 0.0 if j is None else float(np.sqrt(self.covariance[j, j]))
 
     def parameters(self, stages: Collection[str], reach: float) -> list[Parameter]:
         """The estimates that act first in one of some stages, as parameters with correlated priors.
@@ -68,13 +64,6 @@ class Known:
             out.append(Parameter(name, value, spread, max(low, float(ends[0])), min(high, float(ends[1])), log=log,
                                  correlation=correlation))
         return out
-
-
-def limits(name: str) -> EffectParameter | ModelParameter:
-    """The limits of a parameter of the model, of the measurement chain or of an effect."""
-    k = key(name)
-    return CATALOGUE[k.owner].parameters[k.name] if k.owner in CATALOGUE else PARAMETERS[
-        name if k.owner else f"model.{name}"]
 
 
 def is_parameter(name: str) -> bool:

@@ -209,8 +209,7 @@ def _of_angle(model: Model, recordings: Sequence[Signals]) -> list[Parameter]:
 
 def absent(parameters: Sequence[Parameter]) -> dict[str, float]:
     """The sizes at which effects among the parameters are absent, by name."""
-    names = [key(p.name) for p in parameters]
-    return {k.plain: CATALOGUE[k.owner].parameters[k.name].neutral for k in names if k.owner in CATALOGUE}
+    return {key(p.name).plain: absent_at(p.name) for p in parameters if key(p.name).owner in CATALOGUE}
 
 
 def held(model: Model) -> list[str]:

@@ -8,8 +8,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from aeropend_ident.estimation.parameter import key
-from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.effects import CATALOGUE, EffectParameter
 from aeropend_sim.model.parameters import PARAMETERS, Model
+from aeropend_sim.model.parameters import Parameter as ModelParameter
 
 Values = Mapping[str, float]
 
@@ -75,10 +76,16 @@ def neutral(model: Model, name: str) -> float:
     return model.effect(k.owner, k.name) if k.owner else model.model[k.name]
 
 
+def limits(name: str) -> EffectParameter | ModelParameter:
+    """The limits of a parameter of the model, of the measurement chain or of an effect."""
+    k = key(name)
+    return CATALOGUE[k.owner].parameters[k.name] if k.owner in CATALOGUE else PARAMETERS[
+        name if k.owner else f"model.{name}"]
+
+
 def clipped(name: str, value: float) -> float:
     """A value within the range of its parameter."""
-    k = key(name)
-    p = CATALOGUE[k.owner].parameters[k.name] if k.owner else PARAMETERS[f"model.{k.name}"]
+    p = limits(name)
     return min(max(value, p.low), p.high)
 
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What has changed since earlier verdicts: a table of before and after, and what is as it was."""
+"""What has changed since earlier verdicts, as texts: a section of the page, and lines for the terminal."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from aeropend_ident.diagnosis.document import Change, DiagnosisDocument, Interval
+from aeropend_ident.diagnosis.document import Change, DiagnosisDocument, Interval, Since
 from aeropend_ident.diagnosis.report.number_format import interval, percent, quantity
 
 APPEARED = "was not there"
@@ -29,13 +29,15 @@ class ChangesSection:
     """The section.
 
     Attributes:
-        verdicts: the earlier verdicts.
+        verdicts: the earlier verdicts, in words.
+        several: whether there are several.
         rows: what has changed, what makes a material share of the gap first.
         unchanged: (name, largest change that the recording allows).
         not_shown: parameters of which the recording does not show it.
     """
 
-    verdicts: Sequence[str]
+    verdicts: str
+    several: bool
     rows: Sequence[ChangeRow]
     unchanged: Sequence[tuple[str, str]]
     not_shown: Sequence[str]
@@ -46,9 +48,9 @@ def section(document: DiagnosisDocument) -> ChangesSection | None:
     since = document.since
     if since is None:
         return None
-    rows = [_row(c) for c in sorted(since.changes, key=lambda c: not c.claimed)]
-    return ChangesSection(since.verdicts, rows, [(n, percent(farthest(x))) for n, x in since.unchanged.items()],
-                          since.not_shown)
+    rows = [_row(c) for c in since.by_weight]
+    unchanged = [(name, percent(farthest(x))) for name, x in since.unchanged.items()]
+    return ChangesSection(since.named, len(since.verdicts) > 1, rows, unchanged, since.not_shown)
 
 
 def farthest(change: Interval) -> float:
@@ -65,3 +67,31 @@ def _row(c: Change) -> ChangeRow:
     low, high = sorted((c.change.low / c.before.value, c.change.high / c.before.value))
     return ChangeRow(c.name, before, after, percent(c.change.value / c.before.value, sign=True),
                      f"{percent(low, sign=True)} to {percent(high, sign=True)}", c.claimed)
+
+
+def verdict_line(since: Since, place: str) -> str:
+    """The verdict for the terminal."""
+    if not since.claimed:
+        return f"verdict: nothing has changed since {since.named} that the recording shows"
+    return f"verdict: since {since.named}, this has changed: {', '.join(since.claimed)} ({place})"
+
+
+def lines(since: Since) -> list[str]:
+    """What has changed, in lines for the terminal."""
+    out = [f"  {'changed' if c.claimed else 'small change'}: {described(c)}" for c in since.by_weight]
+    same = [f"{name} (at most {100.0 * farthest(x):.2g} %)" for name, x in since.unchanged.items()]
+    if same:
+        out.append(f"  not changed: {', '.join(same)}")
+    if since.not_shown:
+        out.append(f"  the recording does not show whether these have changed: {', '.join(since.not_shown)}")
+    return out
+
+
+def described(c: Change) -> str:
+    """A change in words: `coulomb_friction.accel 0.41 -> 0.83 rad/s² (+0.42, 0.39 to 0.45)`."""
+    unit = "" if c.unit == "-" else f" {c.unit}"
+    between = f"{c.change.value:+.3g}, {c.change.low:+.3g} to {c.change.high:+.3g}"
+    if c.before is None:
+        return f"{c.name} appeared: {c.after.value:.4g} ({c.after.low:.4g} to {c.after.high:.4g}){unit}"
+    share = f"{100.0 * c.change.value / c.before.value:+.1f} %; " if c.before.value else ""
+    return f"{c.name} {c.before.value:.4g} -> {c.after.value:.4g}{unit} ({share}{between})"

@@ -87,10 +87,9 @@ def verdict(document: DiagnosisDocument) -> list[Part]:
 
 def _since(since: Since) -> list[Part]:
     """What has changed since earlier verdicts."""
-    named, changed = " and ".join(since.verdicts), [c.name for c in since.changes if c.claimed]
-    if not changed:
-        return [Part(f"Nothing has changed since {named} that this recording shows.")]
-    return [Part(f"Since {named}, this has changed: "), *listed(changed), Part(".")]
+    if not since.claimed:
+        return [Part(f"Nothing has changed since {since.named} that this recording shows.")]
+    return [Part(f"Since {since.named}, this has changed: "), *listed(since.claimed), Part(".")]
 
 
 def _claim(effects: Sequence[str], parameters: Sequence[str], *, complete: bool) -> list[Part]:

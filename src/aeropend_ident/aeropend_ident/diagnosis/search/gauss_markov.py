@@ -203,10 +203,12 @@ def fit_gust(residual: Array, theta: Array, gravity: float, damping: float, nois
 
 def _widths(cost: Callable[[Array], float], z: Array) -> Array:
     """Standard deviations (2,) of the parameters from the curvature of the cost; the two are correlated."""
-    s, t = np.diag([CURVATURE_STEP, CURVATURE_STEP])
+    s, t = CURVATURE_STEP * np.eye(2)
+    here = cost(z)
+    own = [max(cost(z + x) - 2.0 * here + cost(z - x), 1e-6) for x in (s, t)]
     mixed = 0.25 * (cost(z + s + t) - cost(z + s - t) - cost(z - s + t) + cost(z - s - t))
-    own = [max(cost(z + x) - 2.0 * cost(z) + cost(z - x), 1e-6) for x in (s, t)]
-    mixed = min(max(mixed, -MOST_CORRELATED * math.sqrt(own[0] * own[1])), MOST_CORRELATED * math.sqrt(own[0] * own[1]))
+    most = MOST_CORRELATED * math.sqrt(own[0] * own[1])
+    mixed = min(max(mixed, -most), most)
     curvature = np.array([[own[0], mixed], [mixed, own[1]]]) / CURVATURE_STEP**2
     return np.asarray(np.sqrt(np.diag(np.linalg.inv(curvature))))
 

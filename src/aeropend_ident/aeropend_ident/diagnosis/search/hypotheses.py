@@ -19,11 +19,11 @@ from aeropend_ident.diagnosis.chain.priors import (
     model_parameters,
     usual_size,
 )
-from aeropend_ident.diagnosis.chain.values import PLACE_OF_PARAMETER, STAGES
+from aeropend_ident.diagnosis.chain.values import PLACE_OF_PARAMETER, STAGES, limits
 from aeropend_ident.diagnosis.policy import angle_only
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH, RANDOM
-from aeropend_sim.model.parameters import PARAMETERS, Model
+from aeropend_sim.model.parameters import Model
 
 MISMATCH_SD = 0.3
 """Relative standard deviation of a parameter that `parameter_mismatch` blames.
@@ -115,20 +115,22 @@ def hypotheses(model: Model, *, mismatches: bool = True, known: Known | None = N
         for name in names:
             nominal = model.model[name]
             if nominal != 0.0:
-                p = PARAMETERS[f"model.{name}"]
-                own = Parameter(name, nominal, MISMATCH_SD * abs(nominal), p.low, p.high, start=1.1 * nominal)
-                all_.append(Hypothesis(PARAMETER_MISMATCH, name, ((own,),)))
+                all_.append(Hypothesis(PARAMETER_MISMATCH, name, ((_far_off(name, nominal),),)))
     return all_
+
+
+def _far_off(name: str, nominal: float) -> Parameter:
+    """A parameter of the model that may be far from its nominal value."""
+    p = limits(name)
+    return Parameter(name, nominal, MISMATCH_SD * abs(nominal), p.low, p.high, start=1.1 * nominal)
 
 
 def _changes(model: Model, known: Known) -> Iterable[Hypothesis]:
     """A parameter or the size of an effect that differs from what earlier verdicts have determined."""
     numbers = {}
     for p in (p for stage in STAGES for p in known.parameters([stage], math.inf)):
-        wide = MISMATCH_SD * abs(p.mean)
-        if key(p.name).owner == "" and known.sd(p.name) < wide:
-            limit = PARAMETERS[f"model.{p.name}"]
-            own = Parameter(p.name, p.mean, wide, limit.low, limit.high, start=1.1 * p.mean)
+        own = _far_off(p.name, p.mean)
+        if key(p.name).owner == "" and known.sd(p.name) < own.sd:
             numbers[p.name] = own
             yield Hypothesis(PARAMETER_MISMATCH, p.name, ((own,),))
     for names in TOGETHER:
