@@ -7,8 +7,8 @@
 
 right: time, angle and command are those of the rig. asked: import does not use what it is not sure of. refused: it
 cannot read the file. wrong: it made a recording that is not that of the rig. Of some tables nobody could know all
-without asking (the counts of a turn, the rate of rows without a time): the share of right answers is that of the
-others. Seeds below 1000 are for development.
+without asking (the counts of a turn, the rate of rows without a time, 60 % or 60 of 255): the first share of right
+answers is that of the others. Seeds below 1000 are for development.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def one(seed: int, number: int, folder: Path) -> tuple[str, str, Drawn]:
     text = said.getvalue()
     if code == 0:
         return ("right" if same(bag, made.truth) else "wrong"), text, made
-    return ("asked" if "  import " in text else "refused"), text, made
+    return ("asked" if "  import " in text or "say --" in text else "refused"), text, made
 
 
 def same(bag: Path, truth: Truth) -> bool:
@@ -110,7 +110,9 @@ def main() -> int:
         print(f"{habit:<28}{len(results):6d}" + "".join(f"{count:7d}" for count in counts))
     right = found["to be known"].count("right") / max(len(found["to be known"]), 1)
     good = 1.0 - (found["all"].count("wrong") + found["all"].count("refused")) / len(found["all"])
-    print(f"right without options, of those to be known: {100.0 * right:.0f} % (at least {100.0 * RIGHT:.0f} %)\n"
+    of_all = found["all"].count("right") / len(found["all"])
+    print(f"right without options, of those to be known: {100.0 * right:.0f} % (at least {100.0 * RIGHT:.0f} %), "
+          f"of all: {100.0 * of_all:.0f} %\n"
           f"right or asked: {100.0 * good:.0f} % ({100.0 * ASKED:.0f} %)")
     return int(right < RIGHT or good < ASKED)
 

@@ -10,7 +10,7 @@ import numpy as np
 import openpyxl
 import scipy.io
 
-from evaluation.habits.tables import Cells, Drawn
+from evaluation.habits.tables import Cells, Drawn, without_units
 
 LAYOUTS = {"text": 0.66, "xlsx": 0.06, "several files": 0.07, "mat, variables": 0.05, "mat, one matrix": 0.03,
            "mat, To File": 0.03, "mat v4": 0.03, "mat, structure with time": 0.03, "mat, timeseries": 0.02, "npz": 0.02}
@@ -34,6 +34,10 @@ def write(made: Drawn, folder: Path, rng: np.random.Generator) -> list[Path]:
     if layout == "mat v4" and made.habits["clock"] == "days":
         layout = "text"
     made.habits["layout"] = layout
+    if layout not in ("text", "xlsx"):
+        made.habits["units"] = "not written"
+    if made.habits["units"] == "not written":
+        made.truth.asks = made.truth.asks or without_units(made)
     folder.mkdir(parents=True)
     columns = {_variable(c.name) or f"x{k + 1}": c.values for k, c in enumerate(made.columns)}
     names = list(columns)
@@ -67,7 +71,7 @@ def write(made: Drawn, folder: Path, rng: np.random.Generator) -> list[Path]:
 
 def _forget(made: Drawn) -> None:
     """A matrix has no names."""
-    made.habits["names"], made.habits["units"] = "none", "not written"
+    made.habits["names"] = "none"
 
 
 def _variable(name: str) -> str:

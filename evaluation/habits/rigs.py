@@ -85,8 +85,9 @@ def draw(rng: np.random.Generator) -> Run:
     while True:
         run = _draw(rng)
         moved = float(np.ptp(run.theta))
-        if np.isfinite(run.theta).all() and np.abs(run.theta).max() < 2.4 and moved > 0.2 and np.ptp(run.w) >= 0.02 * (
-                run.kind != "free"):
+        driven = min(float(np.ptp(run.u)), float(np.ptp(run.w))) >= 0.02
+        if np.isfinite(run.theta).all() and np.abs(run.theta).max() < 2.4 and moved > 0.2 and (
+                driven or run.kind == "free"):
             return run
 
 

@@ -67,6 +67,9 @@ EXTRAS = ("e", "r", "v", "b", "n", "w", "yaw", "filtered", "terms", "acceleratio
 """Columns that nobody needs here."""
 
 
+WHOLE = 30.0
+"""Range of whole numbers above which they may be counts of a turn (choice: 10 degrees with 1024 counts a turn)."""
+
 STEPS = {"deg": ((360.0 / 1024.0, 3), (360.0 / 4096.0, 3), (0.1, 1), (0.01, 2), (1.0, 0), (360.0 / 2000.0, 2)),
          "rad": ((2.0 * math.pi / 4096.0, 5), (0.001, 3), (1e-4, 4), (0.01, 2)), "counts": ((1.0, 0),)}
 """Unit of the angle -> resolutions, and digits after the point."""
@@ -140,11 +143,24 @@ def draw(rng: np.random.Generator) -> Drawn:
     if not said or names == "none":
         for column in columns:
             column.unit = ""
-        if made.truth.volts is not None:
-            made.truth.asks = made.truth.asks or "that the command is in volts is in no file"
     made.habits["units"] = "written" if said and names != "none" else "not written"
     made.columns = columns
     return made
+
+
+def without_units(made: Drawn) -> str:
+    """What is not clear from names and numbers where no units are written; "" if all is."""
+    t, y, u = (next((column for column in made.columns if column.role == role), None) for role in "tyu")
+    assert y is not None
+    if made.truth.volts is not None:
+        return "that the command is in volts is in no file"
+    if t is not None and made.habits["clock"] == "ms" and t.values[0] < 2.0 and set(np.diff(t.values)) == {1.0}:
+        return "ms, or a counter of rows?"
+    if made.habits["angle"] == "deg whole" and np.ptp(y.values) > WHOLE:
+        return "degrees, or counts of a turn?"
+    if u is not None and not u.digits and made.habits["command"] in ("%", "255") and u.values.max() < 100.0:
+        return "%, or counts of 255?"
+    return ""
 
 
 def _shares(count: int) -> NDArray[np.float64]:
@@ -236,6 +252,8 @@ def _angle(rng: np.random.Generator, run: rigs.Run, made: Drawn, names: str) -> 
 def _command(rng: np.random.Generator, run: rigs.Run, made: Drawn, names: str) -> Cells | None:
     if run.kind == "free" or (run.kind == "loop" and rng.random() < 0.06):
         made.habits["command"] = "none" if run.kind == "free" else "not written down"
+        if run.kind != "free":
+            made.truth.asks = "the command is in no file"
         return None
     both = rng.random() < 0.03
     name = _name(rng, names, "u")

@@ -7,7 +7,7 @@ from collections import defaultdict
 
 import numpy as np
 
-from aeropend_ident.tables.guess import about_angle, about_chain, about_pair
+from aeropend_ident.tables.guess import about_angle, about_chain, about_command, about_pair
 from aeropend_ident.tables.traits import gain, origins, traits
 from evaluation.habits import tables
 
@@ -33,6 +33,10 @@ def measure(count: int) -> None:
         for c in rest:
             others = [(gain(seen[id(o)], seen[id(c)]), gain(seen[id(c)], seen[id(o)])) for o in rest if o is not c]
             right[f"chain: {about_chain(others)}"].append(c.role == "y")
+            if c.role != "y":
+                but_angle = [(gain(seen[id(c)], seen[id(o)]), gain(seen[id(o)], seen[id(c)]))
+                             for o in rest if o is not c and o.role != "y"]
+                right[f"behind: {about_command(but_angle)}"].append(c.role == "u")
         for c in columns:
             right[f"angle: {about_angle(seen[id(c)])}"].append(c.role == "y")
             if c.role != "y":

@@ -85,6 +85,8 @@ def test_names_of_many_habits_in_a_loop(t, y, u, r, e):
     ({"t": LONG, "angle": DRIVEN, "pwm": np.rint(9.0 * PUSH)}, "duty", "or of others?"),
     ({"t": LONG, "angle": DRIVEN, "v": PUSH / 10.0}, "duty", "of which supply?"),
     ({"t": LONG, "angle": DRIVEN, "u": PUSH - 10.0}, "duty", "it goes both ways, -10 to 70"),
+    ({"t": LONG, "angle": DRIVEN, "u": np.rint(1054.0 + 8.0 * PUSH)}, "duty", "as pulses in µs?"),
+    ({"time": np.arange(len(LONG)), "angle": DRIVEN, "u [%]": PUSH}, "time", "a counter of rows, or ms?"),
 ])  # fmt: skip
 def test_what_is_in_doubt_is_not_sure(columns, quantity, why):
     guesses, sure = found(**columns)
@@ -99,10 +101,51 @@ def test_a_reference_is_not_taken_for_a_command_that_is_not_there():
     assert "duty" not in sure
 
 
+def test_a_loop_without_names_is_understood_by_its_error():
+    _, sure = found(x1=LONG, x2=HELD, x3=CONTROLLED, x4=GOAL, x5=GOAL - HELD)
+    assert sure == {"time": "x1:s", "theta": "x2:deg", "duty": "x3:%"}
+
+
+def test_a_command_that_a_controller_makes_of_the_angle_is_not_left_out():
+    guesses, sure = found(t=LONG, angle=HELD, control=80.0 - 1.5 * HELD)
+    assert guesses["control"].quantity == "duty" and "angle" not in sure.get("duty", "")
+
+
+def test_a_motor_that_follows_its_command_is_not_the_command():
+    speed, w = [], 0.0
+    for u in PUSH / 100.0:
+        w += (u - w) / 0.3 / RATE
+        speed.append(w)
+    noisy = np.array(speed) + 0.01 * RNG.standard_normal(len(LONG))
+    _, sure = found(x1=LONG, x2=DRIVEN, x3=noisy, x4=PUSH / 100.0)
+    assert sure["duty"] == "x4:1"
+
+
+def test_a_smoothed_angle_is_not_the_angle():
+    smoothed, y = [], NOISY[0]
+    for x in NOISY:
+        y += 0.15 * (x - y)
+        smoothed.append(y)
+    guesses, sure = found(x1=LONG, x2=np.array(smoothed), x3=NOISY, x4=PUSH / 100.0)
+    assert guesses["x2"].why.startswith("a filtered copy of column")
+    assert sure["theta"] == "x3:deg"
+
+
+def test_a_temperature_and_a_switch_are_no_commands():
+    warm, on = np.round(24.0 + 0.02 * LONG, 1), (LONG > 2.0).astype(float)
+    _, sure = found(x1=LONG, x2=DRIVEN, x3=warm, x4=on, x5=PUSH / 100.0)
+    assert sure["duty"] == "x5:1"
+
+
+def test_milliseconds_that_do_not_begin_at_zero_are_no_counter_of_rows():
+    _, sure = found(x1=512401.0 + np.arange(len(LONG)), x2=DRIVEN, x3=PUSH / 100.0)
+    assert sure["time"] == "x1:ms"
+
+
 def test_columns_that_follow_from_others_are_said_to():
     guesses, sure = found(t=LONG, x=DRIVEN, x_=FILTERED, z=np.gradient(DRIVEN, LONG), turned=np.radians(DRIVEN),
                           u=PUSH / 100.0)
-    assert guesses["x_"].why.startswith("a filtered copy of column")
+    assert guesses["x_"].why.startswith("a late copy of column")
     assert guesses["z"].why.startswith("a derivative of column")
     assert "the same as column" in guesses["turned"].why
     assert sure == {"time": "t:s", "theta": "x:deg", "duty": "u:1"}
@@ -124,9 +167,18 @@ def test_the_scales_do_not_matter_for_what_a_column_is():
     ("theta_ref", "reference"), ("Winkelgeschwindigkeit", "angle rate"), ("θ", "theta"), ("pwmOut", "duty"),
     ("kąt", "theta"), ("Führungsgröße", "reference"), ("angle_filt", "filtered"), ("battery", "supply"),
     ("y(t)", "theta"), ("u_t", "duty"), ("k*Ts", "time"), ("ch3", ""), ("motor current", "current"),
+    ("ScopeData.posici_n.values", "theta"), ("s_re", "time"), ("V_p", "voltage"),
 ])  # fmt: skip
 def test_meanings_of_names(name, quantity):
     assert meaning(name).quantity == quantity
+
+
+@pytest.mark.parametrize(("name", "unit", "quantity"), [
+    ("E_PITCH", "V", "voltage"), ("U_PITCH", "V", "duty"), ("VBUS", "V", "supply"), ("e", "deg", "error"),
+    ("motor", "rpm", "omega"),
+])  # fmt: skip
+def test_a_unit_decides_between_meanings_of_a_name(name, unit, quantity):
+    assert meaning(name, unit).quantity == quantity
 
 
 def test_a_small_picture_of_a_column():

@@ -9,6 +9,7 @@ and numbers do not contradict each other. Only what is sure is used without aski
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,11 +38,15 @@ BACK = 0.8
 
 ANGLE = {"jumps and holds": -4.7, "noisy": -2.3, "rough": -0.4, "smooth": 0.9}
 COMMAND = {"jumps and holds": 1.4, "noisy": -1.5, "rough": -0.1, "smooth": -0.4}
+ONE_WAY = -1.5
+"""[nats] Log odds of a command that jumps and holds, and goes one way only (choice: a step test does, 1 in 4)."""
+
 PAIR = {"much": 0.7, "much back": -0.9, "some": 0.0, "some back": -1.4, "little": -1.4, "little back": -2.2,
         "none": -3.3, "none back": -3.1}
 CHAIN = {"followed": -2.2, "last": 0.8}
+BEHIND = {"behind": -1.5, "first": 0.3}
 """[nats] Log odds of what is seen in the angle, in the command, in both, and in the chain of columns that predict each
-other, of which the angle is the last (measured: `make habits ARGS=--weights`)."""
+other, of which the angle is the last and the command the first (measured: `make habits ARGS=--weights`)."""
 
 AGAINST = -3.5
 """[nats] Log odds of the numbers below which they contradict the name (choice: 33 to 1)."""
@@ -55,6 +60,9 @@ swings: fewer than one column in 100)."""
 
 COMMANDED = math.log(0.85 / 0.15)
 """[nats] Log odds that a table holds a command (choice: most arms are driven)."""
+
+OF_THE_ARM = ("angle rate", "acceleration", "filtered")
+"""Quantities that predict the angle because they are its motion."""
 
 SAID = {"jumps and holds": "it jumps and holds", "noisy": "it is noisy", "rough": "", "smooth": "it moves smoothly"}
 
@@ -110,7 +118,7 @@ def guess(table: Table, given: Given | None = None) -> list[Guess]:
     """
     given = given or Given()
     seen = _seen(table)
-    found = [_nothing(one.column) for one in seen]
+    found = [_nothing(one) for one in seen]
     clock = _clock(table, seen, found)
     _arm(table, seen, found, clock, given)
     for k, one in enumerate(seen):
@@ -144,11 +152,11 @@ def _meaning(table: Table, k: int) -> Meaning:
     return meaning(name, table.columns[k].unit)
 
 
-def _nothing(column: Column) -> Guess:
+def _nothing(one: _Seen) -> Guess:
+    column, named = one.column, one.meaning
     if column.is_text:
-        named = meaning(column.name, column.unit)
-        return Guess(named.quantity if named.quantity in ("time", "theta", "duty") else "",
-                     why=f"text: {column.complaint.split(': ', 2)[-1]}")
+        needed = named.quantity in ("time", "theta", "duty") and named.odds >= STRONG
+        return Guess(named.quantity if needed else "", why=f"text: {column.complaint.split(': ', 2)[-1]}")
     share = float(np.isfinite(column.values).mean()) if len(column.values) else 0.0
     return Guess(why="no numbers" if share == 0.0 else "hardly any numbers" if share < FILLED else "")
 
@@ -159,7 +167,7 @@ def _nothing(column: Column) -> Guess:
 def time_of(table: Table) -> tuple[int, float | None] | None:
     """The column of the time, and the size of its unit [s], None if that is not clear; None without a time."""
     seen = _seen(table)
-    found = [_nothing(column) for column in table.columns]
+    found = [_nothing(one) for one in seen]
     k = _clock(table, seen, found)
     if k is None:
         return None
@@ -261,29 +269,51 @@ def about_chain(others: list[tuple[float, float]]) -> str:
     return "followed" if any(theirs >= MUCH and own < 0.5 * theirs for theirs, own in others) else "last"
 
 
+def about_command(others: list[tuple[float, float]]) -> str:
+    """What is seen in the command and all other columns but the angle: a key of `BEHIND`.
+
+    Args:
+        others: gains of the command by each other column, and of it by the command.
+    """
+    return "behind" if any(own >= SOME and theirs < 0.5 * own for own, theirs in others) else "first"
+
+
 def _arm(table: Table, seen: list[_Seen], found: list[Guess], clock: int | None, given: Given) -> None:
     """Find angle and command together."""
     free = [k for k, one in enumerate(seen) if not found[k].quantity and not found[k].why and not one.traits.constant]
     free = sorted(sorted(free, key=lambda k: -abs(seen[k].meaning.odds))[:MOST])
     every = max(len(table) // 2000, 1)
     numbers = {k: np.nan_to_num(table.columns[k].values[::every]) for k in free}
-    follows = _explained(table, seen, found, numbers)
+    explained = _explained(table, seen, found, numbers)
+    follows, loops = explained.odds, explained.loops
     named = {k: (_named(seen[k], "theta"), _named(seen[k], "duty")) for k in free}
     angle = {k: ANGLE[about_angle(seen[k].traits)] + follows.get(k, 0.0) for k in free}
-    command = {k: COMMAND[about_angle(seen[k].traits)] + follows.get(k, 0.0) for k in free}
+    command = {k: COMMAND[about_angle(seen[k].traits)] + ONE_WAY * seen[k].traits.one_way + follows.get(k, 0.0)
+               for k in free}
     gains = {(a, b): gain(seen[a].traits, seen[b].traits) for a in free for b in free if a != b}
     for k in free:
         angle[k] += CHAIN[about_chain([(gains[j, k], gains[k, j]) for j in free if j != k and j not in follows])]
+    in_units = {k for k in free if known("theta", table.columns[k].unit)}
+    for k in free if in_units else ():
+        angle[k] -= WEAK * (not table.columns[k].unit) + STRONG * (k in in_units and not _angle_scale(seen[k])[2])
+    for k in free if len(loops) == 1 else ():  # reference, angle and error: the command is another one
+        if k in loops[0]:
+            command[k] += FOLLOWS
+        else:
+            angle[k] += FOLLOWS
     prior = COMMANDED - math.log(max(len(free) - 1, 1))
     tracked = {(k, j) for k, j in gains
                if named[j][1] <= 0.0 and tracks(table.columns[k].values, table.columns[j].values)}
     both: dict[tuple[int, int | None], float] = {}
     for k in free:
-        moved = any(gains[k, j] >= SOME and j not in follows and (k, j) not in tracked for j in free if j != k)
-        both[k, None] = angle[k] + named[k][0] + MOVED * moved
+        moved = any(gains[k, j] >= SOME and j not in follows and (k, j) not in tracked
+                    and seen[j].meaning.quantity not in OF_THE_ARM for j in free if j != k)
+        both[k, None] = angle[k] + named[k][0] + MOVED * (moved or bool(loops))
     for k, j in gains:
         pair = PAIR[about_pair(gains[k, j], gains[j, k])]
-        both[k, j] = angle[k] + named[k][0] + command[j] + named[j][1] + pair + prior + FOLLOWS * ((k, j) in tracked)
+        behind = BEHIND[about_command([(gains[j, i], gains[i, j]) for i in free if i not in (j, k, *follows)])]
+        both[k, j] = (angle[k] + named[k][0] + command[j] + named[j][1] + pair + behind + prior
+                      + FOLLOWS * ((k, j) in tracked))
     if not both:
         return
     a, b = max(both, key=lambda pair: both[pair])
@@ -294,13 +324,15 @@ def _arm(table: Table, seen: list[_Seen], found: list[Guess], clock: int | None,
     first, second = _contradictions(seen, found, angle, named, a, b)
     rival = _rival(both[a, b], {pair[0]: odds for pair, odds in sorted(rivals.items(), key=lambda one: one[1])
                                 if pair[0] != a})
+    if rival is None and named[a][0] <= 0.0:  # the angle is a late copy of its reference, if the loop is good
+        rival = next((k for k, of in explained.late.items() if of == a), None)
     doubt = first or ("" if rival is None else f"or column {table.label(rival)}?")
     unit, scale, clear = _angle_scale(seen[a])
     found[a] = Guess("theta", unit, _reason(seen[a], "theta", scale, doubt), clear and not doubt)
     others = {pair[1]: odds for pair, odds in rivals.items() if pair[0] == a and pair[1] != b}
     if b is None:
         others = {k: odds for k, odds in others.items() if k is not None and (
-            gains[a, k] >= LITTLE or named[k][1] > 0.0)}
+            (gains[a, k] >= LITTLE and named[k][1] > -STRONG and k not in follows) or named[k][1] > 0.0)}
         rival = _rival(both[a, b], others)
         movers = [k for k in free if k != a and gains[a, k] >= LITTLE and k not in follows and (a, k) not in tracked
                   and seen[k].meaning.odds < STRONG]
@@ -335,33 +367,51 @@ def _rival(best: float, others: dict[Any, float], none: int | None = None) -> in
     return (none if k is None else k) if others[k] > best - SURE else None
 
 
-def _explained(table: Table, seen: list[_Seen], found: list[Guess], numbers: dict[int, Floats]) -> dict[int, float]:
-    """Recognise columns that are computed from others; returns log odds."""
+@dataclass(frozen=True)
+class _Explained:
+    """Columns that are computed from others.
+
+    Attributes:
+        odds: [nats] log odds of angle or command for each.
+        loops: triples of which one is the difference of the others, as reference, angle and error.
+        late: late copies -> the column that they copy.
+    """
+
+    odds: dict[int, float]
+    loops: list[tuple[int, int, int]]
+    late: dict[int, int]
+
+
+def _explained(table: Table, seen: list[_Seen], found: list[Guess], numbers: dict[int, Floats]
+               ) -> _Explained:
+    """Recognise columns that are computed from others."""
     odds: dict[int, float] = {}
-    errors = set()
+    late: dict[int, int] = {}
+    loops, errors = [], set()
     for trio in differences(numbers):
         k = _error_of(seen, numbers, trio)
-        i, j = (one for one in trio if one != k)
-        found[k] = Guess(why=f"the difference of columns {table.label(i)} and {table.label(j)}")
-        odds[k] = FOLLOWS
+        found[k] = Guess(why="the difference of columns {} and {}".format(*(table.label(j) for j in trio if j != k)))
         errors.add(k)
-        odds |= {one: FOLLOWS for one in (i, j) if seen[one].traits.holds or (  # the reference, then
-            seen[one].meaning.quantity == "reference")}
-    hidden = [k for k in numbers if k not in errors and any(
-        is_error(table.columns[k].values, table.columns[j].values) and _named(seen[k], "theta") <= 0.0
-        and not seen[k].traits.holds and (_named(seen[j], "theta") > 0.0 or (len(numbers) == 2 and k > j))
-        for j in numbers if j != k)]
+        loops.append(trio)
+        odds |= {j: FOLLOWS for j in trio if j == k or seen[j].traits.holds or (  # the reference, then
+            seen[j].meaning.quantity == "reference")}
+    hidden = [k for k in numbers if not any(k in trio for trio in loops) and not seen[k].traits.holds
+              and seen[k].meaning.quantity not in ("theta", "duty", "voltage") and any(
+                  is_error(table.columns[k].values, table.columns[j].values)
+                  and (_named(seen[j], "theta") > 0.0 or (len(numbers) == 2 and k > j)) for j in numbers if j != k)]
     for k in hidden:
         found[k] = Guess(why="what is missing to a reference that jumps and holds")
         odds[k] = FOLLOWS
     rest = [k for k in numbers if k not in errors and k not in hidden]
-    said = {"same": "the same as", "filtered": "a filtered copy of", "noisy": "a noisy copy of",
-            "derivative": "a derivative of"}
+    said = {"same": "the same as", "filtered": "a filtered copy of", "late": "a late copy of",
+            "noisy": "a noisy copy of", "derivative": "a derivative of"}
     for k, origin in _ordered(seen, origins([one.traits for one in seen], rest)).items():
-        if origin.how in said:
+        commanded = [seen[j].meaning.quantity in ("duty", "voltage") for j in (k, origin.of)]
+        if origin.how in said and commanded != [True, False]:  # a controller makes its command of the angle
             found[k] = Guess(why=f"{said[origin.how]} column {table.label(origin.of)}")
             odds[k] = FOLLOWS
-    return odds
+            late |= {k: origin.of} if origin.how == "late" else {}
+    return _Explained(odds, loops, late)
 
 
 def _error_of(seen: list[_Seen], numbers: dict[int, Floats], trio: tuple[int, int, int]) -> int:
@@ -419,20 +469,20 @@ def _contradictions(seen: list[_Seen], found: list[Guess], angle: dict[int, floa
     elif angle[a] < AGAINST:
         first = "but it does not move as an arm"
     else:
-        first = _also(found, {k: odds[0] for k, odds in named.items()}, a, "theta")
+        first = _also(seen, found, named, a, "theta")
     if b is not None and named[b][1] < 0.0:
         second = f"but its name says {seen[b].meaning.quantity or seen[b].column.unit}"
     elif b is not None:
-        second = _also(found, {k: odds[1] for k, odds in named.items()}, b, "duty")
+        second = _also(seen, found, named, b, "duty")
     return first, second
 
 
-def _also(found: list[Guess], named: dict[int, float], chosen: int, quantity: str) -> str:
+def _also(seen: list[_Seen], found: list[Guess], columns: Collection[int], chosen: int, quantity: str) -> str:
     """Whether another column has the name of a quantity too, and is not computed from others."""
-    for k, odds in named.items():
-        if k != chosen and odds >= STRONG and not found[k].why:
-            return f"but the name of column {k + 1} says {quantity} too" if named[chosen] >= STRONG else (
-                f"but the name of column {k + 1} says {quantity}")
+    for k in columns:
+        if k != chosen and seen[k].meaning == Meaning(quantity, STRONG) and not found[k].why:
+            return f"but the name of column {k + 1} says {quantity}" + " too" * (
+                seen[chosen].meaning == Meaning(quantity, STRONG))
     return ""
 
 

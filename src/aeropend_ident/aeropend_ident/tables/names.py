@@ -7,7 +7,7 @@ import re
 import unicodedata
 from dataclasses import dataclass
 
-from aeropend_ident.tables.units import split_name
+from aeropend_ident.tables.units import RPM, UNITS, known, split_name
 
 STRONG, WEAK = 4.0, 2.0
 """[nats] Log odds of a name that means one thing, and of one that often means it (choices: 50 and 7 to 1)."""
@@ -72,6 +72,11 @@ WORDS: dict[str, tuple[str, str]] = {
 }  # fmt: skip
 """Quantity -> words that mean it, and words that often do, in lower case without accents. The first quantity counts."""
 
+OF_SIMULINK = ("scope", "data", "values", "signals")
+"""Parts of the names of fields that say nothing of the signal."""
+
+_LONG = sorted({word for texts in WORDS.values() for text in texts for word in text.split() if len(word) > 3})
+
 _SPLIT = re.compile(r"[^\w°#]+|_|(?<=[a-zäöüа-я])(?=\d)|(?<=[a-z])(?=[A-Z])")
 _ARGUMENT = re.compile(r"\s*[(\[]\s*(?:t|k|n|i|:|\d*|:\s*,\s*\d+)\s*[)\]]$")
 
@@ -102,16 +107,42 @@ def meaning(name: str, unit: str = "") -> Meaning:
     if unit and split_name(name)[0] != unit:
         name = split_name(name)[0]
     parts = words(name)
+    lost = _without_lost_letters([part for part in parts if part not in OF_SIMULINK])
+    parts = [lost] if lost else parts
     joined = "".join(parts)
     found = [Meaning(quantity, odds) for quantity, texts in WORDS.items()
              for odds, text in zip((STRONG, WEAK), texts) if _has(parts, joined, text.split())]
     strong = [one for one in found if one.odds == STRONG]
     letters = [one for one in found if one.odds == WEAK and one.quantity not in ("theta", "index", "time")]
+    by_unit = _of_unit(unit)
+    possible = (by_unit, "duty", "supply") if by_unit == "voltage" else (by_unit,)
+    if by_unit and not any(one.quantity in possible for one in found):
+        return Meaning(by_unit, STRONG)  # the letter of E_PITCH in V does not mean an error
     if len(strong) == 1 and strong[0].quantity == "theta" and letters and len(parts) > 1:
         return Meaning(letters[0].quantity, WEAK)  # U_PITCH, theta_d: a letter says what of the angle
-    if not strong and len(found) > 1 and found[0].quantity == "time" and parts[0] != "t":
-        return found[1]  # u_t
+    if not strong and len(found) > 1:
+        return min(found, key=lambda one: _place(parts, WORDS[one.quantity][1].split()))  # u_t, V_p
     return (strong or found or [Meaning()])[0]
+
+
+def _place(parts: list[str], known_words: list[str]) -> int:
+    """Which part of a name is the first that is a known word; their number if only all together are."""
+    return next((k for k, part in enumerate(parts) if part in known_words), len(parts))
+
+
+def _of_unit(unit: str) -> str:
+    """The quantity that alone has a unit; "" if several have it, or none."""
+    if speed := known("omega", unit):
+        return "omega" if UNITS["omega"][speed] == RPM else ""
+    return next((quantity for quantity in ("voltage", "current") if known(quantity, unit)), "")
+
+
+def _without_lost_letters(parts: list[str]) -> str:
+    """The word of a name that lost its letters with accents, as in variables of MATLAB (posici_n); "" for others."""
+    if len(parts) < 2 or max(map(len, parts)) == 1:
+        return ""
+    pattern = re.compile(".".join(map(re.escape, parts)))
+    return next((word for word in _LONG if pattern.fullmatch(word)), "")
 
 
 def _has(parts: list[str], joined: str, known_words: list[str]) -> bool:

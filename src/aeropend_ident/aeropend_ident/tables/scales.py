@@ -37,6 +37,9 @@ FULL = (255, 1000, 1023, 4095, 65535)
 PERCENT = {"duty", "dutycycle", "tastgrad", "tastverhaltnis", "throttle", "ciclo", "percent", "скважность", "占空比"}
 """Words for a command that is a share of full duty."""
 
+PULSES = {"esc", "us", "servo", "pulse", "throttle", "ppm"}
+"""Words for a command that is the width of a pulse."""
+
 LEAST_SHARE = 0.1
 """Least duty that is taken for one if the number 1 is full duty (choice)."""
 
@@ -66,8 +69,7 @@ def of_time(values: Floats, said: str, words: list[str]) -> Scale:
         plain = known("time", named) or named
         possible = 0.1 <= 1.0 / (rows * UNITS["time"][plain]) <= 1e5
         return "" if said else plain, f"in {named}" if possible else f"in {named}, {step:.4g} apart?", possible
-    whole = bool((x == np.rint(x)).all())
-    if whole and step == 1.0 and (steps == 1.0).all():
+    if x[0] in (0.0, 1.0) and (steps == 1.0).all():
         return "", "steps of 1: a counter of rows, or ms?", False
     if not fits:
         return "", f"{step:.3g} apart: in which unit?", False
@@ -111,7 +113,8 @@ def of_command(values: Floats, words: list[str], *, counts: bool) -> Scale:
     low, top = float(x.min()), float(x.max())
     text = f"{low:.4g} to {top:.4g}"
     if low >= 900.0 and 1100.0 <= top <= 2100.0:
-        return "counts:1000..2000", f"{text}, as pulses in µs", True
+        sure = low <= 1000.0 or top == 2000.0 or bool(set(words) & PULSES)
+        return "counts:1000..2000", f"{text}, as pulses in µs" + "?" * (not sure), sure
     if top <= 1.0:
         return "1", f"up to {top:.4g}", top >= LEAST_SHARE
     full = next((full for full in FULL if top <= full), None)

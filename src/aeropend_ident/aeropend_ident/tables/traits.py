@@ -36,6 +36,10 @@ HELD, JUMP = 0.8, 0.05
 """Least share of rows that equal the row before, and least size of the other steps as a share of the range, of a column
 that jumps and holds (choices)."""
 
+ONE_WAY = 0.8
+"""Least ratio of the way from the first to the last number to the sum of all steps of a column that goes one way, as a
+temperature or a switch does (choice: it may step back once)."""
+
 ROUGH = 0.9
 """Least ratio of second to first differences of the blocks of a rough column (measured: `make habits ARGS=--weights`;
 a sine of `CYCLE` blocks has 0.6, white noise 1.7)."""
@@ -53,6 +57,9 @@ the derivative of a column (choices)."""
 NEAR = 0.35
 """Greatest median distance of an angle from its reference, as a share of its standard deviation (choice)."""
 
+SLOWEST = 0.98
+"""Greatest pole of a low-pass that smooths a column: what is slower integrates (choice: 50 rows)."""
+
 LATE = 1.0
 """[rows] Least delay of a filtered copy (choice: a shorter one may be noise)."""
 
@@ -69,6 +76,7 @@ class Traits:
         block: number of rows in a block.
         constant, ramp: it never changes; it rises evenly, as a clock.
         holds, rough, noisy: see `HELD`, `ROUGH`, `NOISY`.
+        one_way: it holds, and never falls, or never rises.
     """
 
     x: Floats
@@ -78,6 +86,7 @@ class Traits:
     holds: bool = False
     rough: bool = False
     noisy: bool = False
+    one_way: bool = False
 
 
 def traits(values: Floats) -> Traits:
@@ -93,9 +102,10 @@ def traits(values: Floats) -> Traits:
     b = blocks(x, block)
     steps = np.abs(np.diff(filled))
     moved = steps[steps > 0.0]
+    holds = bool((steps == 0.0).mean() >= HELD and np.median(moved) >= JUMP * np.ptp(filled))
     return Traits(
-        x, block, ramp=is_ramp(values[known]),
-        holds=bool((steps == 0.0).mean() >= HELD and np.median(moved) >= JUMP * np.ptp(filled)),
+        x, block, ramp=is_ramp(values[known]), holds=holds,
+        one_way=holds and abs(float(filled[-1] - filled[0])) >= ONE_WAY * float(steps.sum()),
         rough=bool(np.std(np.diff(b, 2)) >= ROUGH * np.std(np.diff(b))),
         noisy=bool(np.std(np.diff(x, 2)) >= NOISY))
 
@@ -160,7 +170,8 @@ class Origin:
 
     Attributes:
         of: the number of the other column.
-        how: "same", "mirrored", "filtered", "noisy", "derivative".
+        how: "same", "mirrored", "filtered", "late" (filtered too, or an angle that follows its reference), "noisy",
+            "derivative".
     """
 
     of: int
@@ -192,6 +203,9 @@ def _origin(x: Traits, y: Traits) -> tuple[float, str]:
     r = float(np.mean(x.x * y.x))
     if r * r >= SAME:
         return r * r, "same" if r > 0.0 else "mirrored"
+    smoothed = _smoothed(x.x, y.x)
+    if smoothed >= COPIED:
+        return smoothed, "filtered"
     block = max(y.block // 2, 1)
     a, b = blocks(x.x, block), blocks(y.x, block)
     if x.holds or y.holds or len(b) < BLOCKS:
@@ -205,11 +219,23 @@ def _origin(x: Traits, y: Traits) -> tuple[float, str]:
         copy, change, _ = np.linalg.lstsq(np.stack((middle, rate, np.ones_like(rate)), 1), inner, rcond=None)[0]
         late = -block * change / copy  # in rows, by the first terms of Taylor's series
         if abs(late) >= LATE:
-            return (copied, "filtered") if late > 0.0 else (0.0, "")
+            return (copied, "late") if late > 0.0 else (0.0, "")
         noisier = np.std(np.diff(x.x, 2)) > np.std(np.diff(y.x, 2))
         return (copied, "noisy") if noisier else (0.0, "")
     derived = max(1.0 - _left([column[:, None]], inner) / total for column in (rate, turn))
     return (derived, "derivative") if derived >= DERIVED else (0.0, "")
+
+
+def _smoothed(x: Floats, y: Floats) -> float:
+    """Share of the turns of x (N,) that a low-pass of first order of y explains; 0 if it needs another pole.
+
+    A turn is a second difference: first ones are explained by anything that is smooth.
+    """
+    terms = np.stack((x[:-1], y[1:], np.ones(len(x) - 1)), 1)
+    pole, of_y, _ = np.linalg.lstsq(terms, x[1:], rcond=None)[0]
+    if not 0.0 < pole <= SLOWEST or of_y <= 0.0:
+        return 0.0
+    return 1.0 - _left([terms[:, :2]], x[1:]) / (float(np.var(np.diff(x, 2))) or 1.0)
 
 
 def tracks(y: Floats, r: Floats) -> bool:
@@ -229,7 +255,9 @@ def tracks(y: Floats, r: Floats) -> bool:
 def is_error(x: Floats, y: Floats) -> bool:
     """Whether x (N,) is the distance of y from a reference that jumps and holds, and is not in the table."""
     both, alone = np.abs(np.diff(x + y)), np.abs(np.diff(y))
-    return bool(np.percentile(both, 100.0 * HELD) <= 0.1 * np.percentile(alone, 100.0 * HELD))
+    moved = alone > 0.0
+    return bool(moved.any() and (both[moved] <= 0.1 * alone[moved]).mean() >= HELD
+                and np.percentile(both, 100.0 * HELD) <= 0.1 * np.median(alone[moved]))
 
 
 def differences(columns: dict[int, Floats]) -> list[tuple[int, int, int]]:
