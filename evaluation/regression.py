@@ -98,7 +98,7 @@ def diagnosed(folder: Path, names: tuple[str, ...], *, fit_nominal: bool) -> dic
     paths = [folder / "recordings" / name for name in names]
     try:
         if fit_nominal:
-            signals = [signals_of(p, None, model.sensing, fit_nominal=True) for p in paths]
+            signals = [signals_of(p, None, model, fit_nominal=True) for p in paths]
         else:
             signals = [from_recording(recording.read(str(p)), model.sensing) for p in paths]
         found = diagnose(model, signals, 1, fit_nominal=fit_nominal)

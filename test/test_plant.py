@@ -107,6 +107,15 @@ def test_commands_are_clamped_and_nonsense_is_refused_and_counted(graph, start):
     assert plant.output.count("refused") == 1
 
 
+def test_a_bridge_that_reverses_takes_commands_below_0(graph, start):
+    start("plant", "--ros-args", "-p", "model.v_full:=2.4", "-p", "model.reverse:=1.0")
+    with graph.listening(BatteryState, ARMATURE) as armature, graph.talking(Float64, DUTY_COMMAND) as send:
+        for command, duty in ((-0.5, -0.5), (-7.0, -1.0), (0.25, 0.25)):
+            send(Float64(data=command))
+            graph.until(lambda duty=duty: armature and armature[-1].percentage == np.float32(duty), f"duty {duty}")
+        graph.until(lambda: abs(armature[-1].voltage - 0.6) < 0.03, "a quarter of 2.4 V")
+
+
 def test_off_means_duty_0_until_the_next_command_after_on(graph, start):
     start("plant")
     with graph.listening(BatteryState, ARMATURE) as armature, graph.talking(Float64, DUTY_COMMAND) as send:

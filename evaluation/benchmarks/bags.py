@@ -162,7 +162,7 @@ def diagnosing(quick: bool) -> list[Figure]:
         runs = [diagnosed(bag, "--out", out) for out in outs]
         found = json.loads((outs[-1] / "diagnosis.json").read_text(encoding="utf-8"))
         model = load("bench")
-        signals = signals_of(bag, None, model.sensing)
+        signals = signals_of(bag, None, model)
         peers = {SPARSE: sparse_regression(signals, model), STEPWISE: stepwise_bic(signals, model)}
     seconds = np.array([one.seconds for one in runs])
     of_peer = Spread.of(peers[STEPWISE]["seconds"])

@@ -65,7 +65,7 @@ def diagnose_all(out: Path, jobs: int, only: Sequence[str] = (), *, fit_nominal:
     def one(_: int, name: str) -> None:
         started, model = time.perf_counter(), model_of(out, name)
         try:
-            signals = signals_of(out / "recordings" / name, None, model.sensing, fit_nominal=fit_nominal)
+            signals = signals_of(out / "recordings" / name, None, model, fit_nominal=fit_nominal)
             result = diagnose(model, [signals], 1, fit_nominal=fit_nominal)
             body = to_json(document(result, [name], MODEL, time.perf_counter() - started))
         except RecordingError as error:

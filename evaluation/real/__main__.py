@@ -108,7 +108,7 @@ def row(rig: Rig, folder: Path, out: Path, *, peer: bool, jobs: int) -> Row:
         bag = out / "bags" / rig.name
         words = [str(folder / rig.file), str(bag), *shlex.split(rig.options)]
         import_table.run(import_table.parse(words), words)
-        return signals_of(bag, None, load("bench").sensing, fit_nominal=True)
+        return signals_of(bag, None, load("bench"), fit_nominal=True)
 
     return judged(rig, signals, out, peer=peer, jobs=jobs)
 
@@ -124,7 +124,7 @@ def drawn_row(seed: int, k: int, out: Path, *, peer: bool, jobs: int) -> Row:
         nothing = np.full(len(d.duty), np.nan)
         bags.write(bag, {"theta": d.theta, "omega": nothing, "i_a": nothing, "v_a": nothing, "duty": d.duty},
                    round(d.period * 1e9))
-        return signals_of(bag, None, load("bench").sensing, fit_nominal=True)
+        return signals_of(bag, None, load("bench"), fit_nominal=True)
 
     return judged(Rig(f"drawn-{k}", f"drawn-{k}", "", "", known), signals, out, peer=peer, jobs=jobs)
 

@@ -123,7 +123,7 @@ def diagnosed(folder: Path, name: str, *, keep: bool = False, kept: bool = False
 
 def _read(path: Path, model: Model, fit: bool) -> Signals:
     if fit:
-        return signals_of(path, None, model.sensing, fit_nominal=True)
+        return signals_of(path, None, model, fit_nominal=True)
     return from_recording(recording.read(str(path)), model.sensing)
 
 

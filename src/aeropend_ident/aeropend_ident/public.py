@@ -38,7 +38,7 @@ def diagnose(recordings: Recording | Sequence[Recording], model: Model | str = "
     """
     model = load(model) if isinstance(model, str) else model
     several = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    signals = [as_signals(r, model.sensing, held_out, fit_nominal=fit_nominal) for r in several]
+    signals = [as_signals(r, model, held_out, fit_nominal=fit_nominal) for r in several]
     return diagnosis.diagnose(model, signals, jobs, fit_nominal=fit_nominal, material=material,
                               seconds=seconds)
 

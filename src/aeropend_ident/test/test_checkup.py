@@ -56,9 +56,9 @@ def test_a_good_recording_is_ok(path):
     (lambda r: {"theta": r.theta + 0.4}, "warning", "at rest without duty the angle is 0.4 rad"),
     (lambda r: {"theta": r.theta * 1e-3}, "warning", "the arm hardly moves"),
     (lambda r: {"theta": np.full(len(r), np.nan)}, "error", "no arm angle"),
-    (lambda r: {"duty": 100.0 * r.duty}, "error", "is a fraction, 0 to 1: import it again with its unit"),
+    (lambda r: {"duty": 100.0 * r.duty}, "error", "is a fraction, -1 to 1: import it again with its unit"),
     (lambda r: {"duty": np.full(len(r), 0.3)}, "warning", "the duty stays at 0.3"),
-    (lambda r: {"duty": np.full(len(r), np.nan)}, "warning", "only a free decay"),
+    (lambda r: {"duty": np.full(len(r), np.nan), "v_a": np.full(len(r), np.nan)}, "warning", "only a free decay"),
     (lambda r: {"t": 0.5 * r.t}, "warning", "only 16 s long"),
     (lambda r: {"gaps": np.array([[100, 2000]])}, "warning", "11.3 % of the samples are lost"),
 ])

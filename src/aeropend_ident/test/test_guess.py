@@ -108,7 +108,8 @@ def test_a_loop_without_names_is_understood_by_its_error():
 
 def test_a_command_that_a_controller_makes_of_the_angle_is_not_left_out():
     guesses, sure = found(t=LONG, angle=HELD, control=80.0 - 1.5 * HELD)
-    assert guesses["control"].quantity == "duty" and "angle" not in sure.get("duty", "")
+    assert guesses["control"].quantity == "duty"
+    assert "angle" not in sure.get("duty", "")
 
 
 def test_a_motor_that_follows_its_command_is_not_the_command():
@@ -155,7 +156,7 @@ def test_what_the_user_says_makes_volts_and_both_ways_sure():
     volts = {"t": LONG, "angle": DRIVEN, "u [V]": PUSH / 10.0 - 1.0}
     assert "duty" not in found(**volts)[1]
     assert "duty" not in found(Given(supply=True), **volts)[1]
-    assert found(Given(supply=True, clip=True), **volts)[1]["duty"] == "u [V]"
+    assert found(Given(supply=True, both_ways=True), **volts)[1]["duty"] == "u [V]"
 
 
 def test_the_scales_do_not_matter_for_what_a_column_is():

@@ -79,7 +79,7 @@ def test_a_proposal_for_columns_without_names(tmp_path, capsys):
     ("t,angle,pwm\n" + lines(TIME, ANGLE, DUTY), "but column 2 \"angle\" does not follow it"),
     ("t,pwm,angle\n" + lines(LONG, DRIVEN, PUSH), "but it does not move as an arm"),
     ("t,angle,v\n" + lines(LONG, DRIVEN, PUSH / 10), "of which supply? add --supply 12V"),
-    ("t,angle,u\n" + lines(LONG, DRIVEN, np.where(PUSH > 0.0, PUSH, -20.0)), "add --both-ways clip"),
+    ("t,angle,u\n" + lines(LONG, DRIVEN, np.where(PUSH > 0.0, PUSH, -20.0)), "add --both-ways reverse, brake or clip"),
     ("k,angle,u\n" + lines(np.arange(len(LONG)), DRIVEN, PUSH), "a counter of rows, or ms?"),
 ])  # fmt: skip
 def test_what_is_not_obvious_is_not_accepted(tmp_path, capsys, text, says):

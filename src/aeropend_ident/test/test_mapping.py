@@ -83,14 +83,25 @@ def test_a_command_in_volts(tmp_path, capsys):
     assert "for a command in volts" in refused(capsys, path, tmp_path / "bag", *MAPPED, "--supply", "12V")
 
 
-@pytest.mark.promise("Tables", "A command that goes both ways is refused, or clipped and counted")
+@pytest.mark.promise("Tables", "A command that goes both ways is refused until it is said what it does")
 def test_a_command_that_goes_both_ways(tmp_path, capsys):
     path = put(tmp_path, "t,x,u\n" + lines(TIME, ANGLE, DUTY - 10.0))
-    assert "--both-ways clip sets 100 rows of 200 to 0" in refused(capsys, path, tmp_path / "bag", *MAPPED, "--duty",
-                                                                   "u:%")
+    said = refused(capsys, path, tmp_path / "bag", *MAPPED, "--duty", "u:%")
+    assert "does it reverse the motor in 100 rows of 200 (--both-ways reverse), brake it (brake)" in said
     recording = imported(tmp_path, path, *MAPPED, "--duty", "u:%", "--both-ways", "clip")
     np.testing.assert_allclose(recording.duty, np.maximum(DUTY - 10.0, 0.0) / 100, atol=1e-7)
     assert "duty: 100 rows of 200 below 0, down to -10 %, set to 0 (as you say)" in capsys.readouterr().out
+
+
+@pytest.mark.promise("Tables", "A command that reverses the motor keeps its sign")
+def test_a_command_that_reverses_the_motor(tmp_path, capsys):
+    path = put(tmp_path, "t,x,u\n" + lines(TIME, ANGLE, DUTY - 10.0))
+    recording = imported(tmp_path, path, *MAPPED, "--duty", "u:%", "--both-ways", "reverse")
+    np.testing.assert_allclose(recording.duty, (DUTY - 10.0) / 100, atol=1e-7)
+    assert "duty: 100 rows of 200 below 0, down to -10 %: they reverse the motor" in capsys.readouterr().out
+    path = put(tmp_path, "t,x,u\n" + lines(TIME, ANGLE, DUTY - 110.0))
+    assert "outside -100..100 %: is its unit right?" in refused(
+        capsys, path, tmp_path / "other", *MAPPED, "--duty", "u:%", "--both-ways", "reverse")
 
 
 def test_days_since_long_ago(tmp_path):

@@ -269,7 +269,7 @@ def test_joined_turns_are_said(tmp_path):
     columns_ = columns(8.0)
     columns_["theta"] = np.mod(columns_["theta"] + 0.01 * np.sin(np.arange(len(columns_["theta"]))), 2.0 * math.pi)
     bags.write(tmp_path / "bag", columns_, round(SAMPLE_PERIOD * 1e9))
-    signals = signals_of(tmp_path / "bag", None, BENCH.sensing)
+    signals = signals_of(tmp_path / "bag", None, BENCH)
     (note,) = (n for n in signals.notes if "turn" in n)
     assert note.startswith("theta jumps by a turn ")
     assert np.nanmin(signals.theta) < -0.005

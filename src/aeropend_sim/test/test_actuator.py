@@ -186,3 +186,34 @@ def test_the_supply_sags_by_its_resistance_times_the_current():
     open_circuit = actuator.sampled_voltage(model.numbers(), duty, model.effects, SAMPLE_PERIOD)
     assert np.array_equal(actuator.terminal_voltage(model, open_circuit, run.i_a), run.v_a)
     assert actuator.terminal_voltage(load("bench"), 5.0, 2.0) == 5.0
+
+
+LINEAR = {**BENCH, **dict.fromkeys(("k0", "k1", "k2", "k3"), 0.0), "v_full": 12.0}
+
+
+def test_a_bridge_without_losses_is_a_straight_line():
+    assert actuator.voltage(LINEAR, [0.0, 0.25, 1.0]).tolist() == [0.0, 3.0, 12.0]
+    assert actuator.duty(LINEAR, [0.0, 3.0, 12.0, 15.0]).tolist() == [0.0, 0.25, 1.0, 1.0]
+
+
+@pytest.mark.parametrize("numbers", [BENCH, LINEAR])
+def test_a_duty_below_0_brakes_or_reverses(numbers):
+    forward = actuator.voltage(numbers, 0.4)
+    assert actuator.voltage(numbers, -0.4) == 0.0
+    assert actuator.duty(numbers, -1.0) == 0.0
+    both = {**numbers, "reverse": 0.8}
+    assert actuator.voltage(both, -0.4) == pytest.approx(-0.8 * forward)
+    assert actuator.duty(both, -0.8 * forward) == pytest.approx(-0.4)
+    assert actuator.voltage(both, 0.4) == forward
+
+
+def test_the_drop_of_the_bridge_is_against_the_voltage_in_both_directions():
+    both = {**LINEAR, "reverse": 1.0}
+    drop = {"bridge_drop": {"v_drop": 0.5}}
+    v = actuator.acting_voltage(both, np.array([0.5, -0.5, 0.02, -0.02]), drop, SAMPLE_PERIOD)
+    assert v == pytest.approx([5.5, -5.5, 0.0, 0.0])
+
+
+def test_steady_speed_is_odd():
+    v = np.array([0.5, 2.0])
+    assert actuator.speed_at(BENCH, -v).tolist() == (-actuator.speed_at(BENCH, v)).tolist()

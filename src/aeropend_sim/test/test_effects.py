@@ -48,7 +48,8 @@ CHANGES = {
 }
 
 NUMBERS = {
-    **dict.fromkeys(("k0", "k1", "k2", "k3"), (EVERYTHING, set(Sample._fields))),
+    "reverse": (set(), set()),
+    **dict.fromkeys(("k0", "k1", "k2", "k3", "v_full"), (EVERYTHING, set(Sample._fields))),
     **dict.fromkeys(("R_a", "L_a", "K_e", "K_t", "J_m", "B_m", "k_load"), (EVERYTHING - {"v_a"}, NOT_VOLTAGE)),
     "k_thrust": (ARM | {"thrust"}, ANGLE),
     **dict.fromkeys(("mgd_over_J", "c_over_J", "L_over_J"), (ARM, ANGLE)),

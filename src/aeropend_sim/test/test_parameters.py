@@ -88,6 +88,18 @@ def test_save_keeps_a_mismatch(tmp_path):
     assert again.model["R_a"] == 1.08
 
 
+def test_a_bridge_without_losses_needs_no_duty_map(tmp_path):
+    path = tmp_path / "m.yaml"
+    save(from_flat({"model.v_full": 12.0}, base=load("bench")), path)
+    text = path.read_text(encoding="utf-8")
+    assert "v_full: 12.0" in text
+    assert not [name for name in ("k0", "k1", "k2", "k3", "reverse") if f"{name}:" in text]
+    again = load(path)
+    assert [again.model[name] for name in ("k0", "v_full", "reverse")] == [0.0, 12.0, 0.0]
+    save(load("bench"), path)
+    assert "v_full" not in path.read_text(encoding="utf-8")
+
+
 def test_save_replaces_in_one_step_and_leaves_nothing_else(tmp_path):
     path = tmp_path / "m.yaml"
     save(load("bench"), path)

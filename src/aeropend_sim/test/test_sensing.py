@@ -299,3 +299,12 @@ def test_rows_of_readings_and_states_are_named_in_the_order_of_their_tuples():
     assert dynamics.ROW._fields == dynamics.Trajectory._fields
     assert [*sensing.READING] == [*range(4)]
     assert [*dynamics.ROW] == [*range(7)]
+
+
+def test_pulses_do_not_tell_the_direction():
+    n = 400
+    angle = np.cumsum(np.full(n, 100.0 * H))
+    forward = read(states(n, omega=np.full(n, 100.0), rotor_angle=angle), chain(speed_pulses_per_rev=1.0))
+    backward = read(states(n, omega=np.full(n, -100.0), rotor_angle=-angle), chain(speed_pulses_per_rev=1.0))
+    assert backward[OMEGA, -1] == pytest.approx(100.0, rel=1e-3)
+    assert np.array_equal(forward, backward)

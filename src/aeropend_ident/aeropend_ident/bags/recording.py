@@ -378,12 +378,12 @@ class _Join:
         return columns
 
     def _take_duty_from_command(self) -> None:
-        """Hold the last command the rig would have taken: finite, clamped to 0..1."""
+        """Hold the last command the rig would have taken: finite, clamped to -1..1."""
         times, values = self.command
         taken = np.isfinite(values)
         if not taken.any():
             return
-        times, values = times[taken], np.clip(values[taken], 0.0, 1.0)
+        times, values = times[taken], np.clip(values[taken], -1.0, 1.0)
         last = np.searchsorted(times, self.received, side="right") - 1
         self.columns["duty"] = np.where(last >= 0, values[last], np.nan)
         self.notes.append("no armature: the duty is that of duty_command by the time it was received")

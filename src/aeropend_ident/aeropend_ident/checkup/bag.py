@@ -92,15 +92,18 @@ def _samples(path: str, read: Recording) -> Iterator[Check]:
 
 
 def _duty(path: str, read: Recording) -> Iterator[Check]:
-    """The duty: there, within 0 to 1, moving."""
+    """The duty: there, within -1 to 1, moving."""
     known = read.duty[np.isfinite(read.duty)]
+    if not len(known) and np.isfinite(read.v_a).any():
+        yield ok(path, "no duty: the voltage takes its place (diagnose --uncalibrated, or a model with v_full)")
+        return
     if not len(known):
         yield warning(path, "no duty: only a free decay of the arm can be diagnosed (diagnose --uncalibrated); "
                       "record armature or duty_command too")
         return
     low, high = float(known.min()), float(known.max())
-    if low < 0.0 or high > 1.0:
-        yield error(path, f"the duty goes from {low:.3g} to {high:.3g}, but is a fraction, 0 to 1: import it again "
+    if low < -1.0 or high > 1.0:
+        yield error(path, f"the duty goes from {low:.3g} to {high:.3g}, but is a fraction, -1 to 1: import it again "
                     "with its unit")
     elif high - low < STILL:
         yield warning(path, f"the duty stays at {high:.2g}: record while `excite` runs")
@@ -133,7 +136,7 @@ def _angle(path: str, read: Recording) -> Iterator[Check]:
 def resting_angle(read: Recording) -> float | None:
     """[rad] The angle while the recording begins without duty; None if it does not, or if the arm moves."""
     angle, duty = (x[(read.t < AT_REST) & np.isfinite(x)] for x in (read.theta, read.duty))
-    if len(angle) < 2 or not len(duty) or duty.max() > STILL or np.ptp(angle) > OFF_ZERO:
+    if len(angle) < 2 or not len(duty) or np.abs(duty).max() > STILL or np.ptp(angle) > OFF_ZERO:
         return None
     return float(np.median(angle))
 
@@ -150,11 +153,11 @@ def following(read: Recording) -> float:
 def _use(path: str, read: Recording, model: Model) -> Iterator[Check]:
     """Whether a diagnosis can use it, and what it excites."""
     try:
-        as_signals(read, model.sensing)
+        as_signals(read, model)
     except RecordingError as refused:
         reason = str(refused).removeprefix(f"{path}: ")
         try:
-            as_signals(read, model.sensing, fit_nominal=True)
+            as_signals(read, model, fit_nominal=True)
         except RecordingError as other:
             yield error(path, f"no diagnosis can use it: {str(other).removeprefix(f'{path}: ')}")
         else:

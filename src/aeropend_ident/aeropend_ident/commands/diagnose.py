@@ -132,7 +132,7 @@ def run(options: argparse.Namespace, command: str) -> None:
     else:
         model = load(options.model)
     with progress("reading") as show:
-        signals, tests = ([signals_of(bag, options.namespace, model.sensing, options.held_out,
+        signals, tests = ([signals_of(bag, options.namespace, model, options.held_out,
                                       fit_nominal=uncalibrated) for bag in bags]
                           for bags in (options.bags, options.test))
         found = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal, material=options.material,

@@ -46,7 +46,7 @@ examples:
   import fall.csv my_bag --time 1:s --theta 2:deg --zero end --motor-off
   import day1.xlsx day2.xlsx bags --sheet Data --time 1:s --theta 2:deg --duty 3:%
   import adc.npy my_bag --rate 490 --theta 1:counts:1024 --zero 512 --flip
-  import rig.csv my_bag --time t:s --theta y:rad --duty u:V --supply 12V --both-ways clip
+  import rig.csv my_bag --time t:s --theta y:rad --duty u:V --supply 12V --both-ways reverse
   import angle.csv my_bag --with voltage.csv --accept --supply 12V
 
 COLUMN is the name of a column in the file, or its number, from 1. A unit may have a factor: `--theta pot:54deg` if one
@@ -82,9 +82,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     more.add_argument("--motor-off", action="store_true", help="the duty was always 0, as in a free swing")
     more.add_argument("--supply", metavar="VOLTAGE",
                       help="voltage of the supply, as in 12V: full duty, for a command in volts (--duty COLUMN:V)")
-    more.add_argument("--both-ways", choices=("clip",), default="",
-                      help="clip: set a command that reverses or brakes the motor to 0 there, and count the rows; "
-                           "without it such a command is refused")
+    more.add_argument("--both-ways", choices=("reverse", "brake", "clip"), default="",
+                      help="what a command below 0 does: reverse the motor; brake it, or nothing (clip): both count "
+                           "as 0; without it such a command is refused")
     more.add_argument("--with", action="append", default=[], metavar="FILE", dest="others",
                       help="another file of the same experiment, joined by its time: each row takes the last value "
                            "before it; may be repeated")
@@ -168,7 +168,7 @@ def run(given: argparse.Namespace, arguments: Sequence[str]) -> int:
                 table = _read(file, given)
                 now, unsure = plan, ""
                 if not plan.columns():
-                    found = guess(table, Given(plan.supply is not None, plan.both_ways == "clip"))
+                    found = guess(table, Given(plan.supply is not None, bool(plan.both_ways)))
                     chosen = options(table, found)
                     if plan.rate is not None:
                         chosen.pop("time", None)

@@ -132,7 +132,7 @@ def _tasks(bags: Sequence[str], commands: Sequence[str], settings: Settings) -> 
     for bag, command in zip(bags, commands):
         started = time.monotonic()
         try:
-            signals = signals_of(bag, settings.namespace, settings.model.sensing, settings.held_out,
+            signals = signals_of(bag, settings.namespace, settings.model, settings.held_out,
                                  fit_nominal=settings.fit_nominal)
         except Exception as error:
             yield _Task(bag, command, settings, error=_why(bag, error))

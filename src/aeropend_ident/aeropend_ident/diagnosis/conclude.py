@@ -33,7 +33,7 @@ from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.signals import Signals
 from aeropend_ident.signals.statistics import Z95
 from aeropend_sim.model.excitation import Excitation
-from aeropend_sim.model.parameters import MODEL_NAMES, PARAMETERS, Model
+from aeropend_sim.model.parameters import DUTY_MAP, MODEL_NAMES, OPTIONAL, PARAMETERS, Model
 
 DETERMINED = 0.5
 """Share of a prior's width above which the recordings have not determined a parameter (choice)."""
@@ -69,7 +69,8 @@ def parameter_rows(chains: CutChains, joint: JointFit) -> dict[str, ParameterRow
     fitted = {p.name: p for stage in STAGES for p in model_parameters(chains, stage)}
     alone = angle_only(chains.recordings)
     rows: dict[str, ParameterRow] = {}
-    for n in MODEL_NAMES:
+    left_out = {key(name).name for name in (*OPTIONAL, *DUTY_MAP) if nominal[key(name).name] == 0.0}
+    for n in (name for name in MODEL_NAMES if name not in left_out):
         limits = PARAMETERS[f"model.{n}"]
         p = fitted.get(n, Parameter(n, nominal[n], UNCALIBRATED_SD, limits.low, limits.high, log=nominal[n] > 0.0))
         # with the angle alone, only the curve from duty to lift is identifiable, not its parameters

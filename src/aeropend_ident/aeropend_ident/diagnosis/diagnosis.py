@@ -124,6 +124,8 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
         notes: tuple[str, ...] = ()
         if fit_nominal:
             progress("identifying the nominal model", 0.0)
+            if any(s.both_ways for s in recordings):
+                model = replace(model, model={**model.model, "reverse": 1.0})
         if policy.wide_search and angle_only(recordings):
             rig = fit_driven_rig(model, recordings)
             found, likely = without_findings(rig.model, model, recordings, material)
@@ -388,7 +390,8 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
                for c, x in _left(stages, gust=found.statistical.gust is not None).items() if x > GOOD_ENOUGH]
     reasons = [failed] if failed else reasons
     undecided = conclude.not_separable(chains, stages)
-    tried = EXPERIMENTS if calibrated else experiments_within(max(float(s.duty.max()) for s in found.recordings))
+    tried = EXPERIMENTS if calibrated else experiments_within(
+        max(float(np.abs(s.duty).max()) for s in found.recordings))
     rows = conclude.parameter_rows(chains, joint)
     closed, low, high = closure(gaps.before, gaps.after, gaps.floors)
     places = gap_share.share_of_places(parts, lambda: _parts_of_parameters(joint, gaps))

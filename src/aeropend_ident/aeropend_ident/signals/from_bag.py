@@ -24,6 +24,7 @@ from aeropend_ident.signals.noise import reading_noise_at
 from aeropend_ident.signals.outliers import joined_turns
 from aeropend_ident.signals.pulses import hold
 from aeropend_ident.signals.signals import CHANNELS, MINIMUM_DURATION, STILL, Signals, from_arrays
+from aeropend_sim.model.parameters import Model
 from aeropend_sim.wording import counted
 
 Array = NDArray[np.float64]
@@ -60,30 +61,30 @@ RESTS, SETTLES, MOSTLY = 0.02, 0.05, 0.5
 kept; and share of the held-out part that rests from which on it is left out (choice)."""
 
 
-def signals_of(bag: str | Path, namespace: str | None, sensing: Mapping[str, float], held_out: float = 0.3, *,
+def signals_of(bag: str | Path, namespace: str | None, model: Model, held_out: float = 0.3, *,
                fit_nominal: bool = False) -> Signals:
     """Read a bag as signals.
 
     Args:
         bag: folder or file; see `recording.read`.
         namespace: of the rig, if the bag holds several.
-        sensing: parameters of the model's measurement chain.
+        model: gives the parameters of the measurement chain, and the duty of a voltage.
         held_out: share of the recording at its end that models are not fitted to.
         fit_nominal: whether the rig is uncalibrated.
 
     Raises:
         RecordingError: no verdict is possible; one line that says why.
     """
-    return as_signals(recording.read(bag, namespace), sensing, held_out, fit_nominal=fit_nominal)
+    return as_signals(recording.read(bag, namespace), model, held_out, fit_nominal=fit_nominal)
 
 
-def as_signals(read: Recording, sensing: Mapping[str, float], held_out: float = 0.3, *, fit_nominal: bool = False
+def as_signals(read: Recording, model: Model, held_out: float = 0.3, *, fit_nominal: bool = False
                ) -> Signals:
     """A recording as signals; arguments and errors as for `signals_of`.
 
     Args:
         read: the recording.
-        sensing: parameters of the model's measurement chain.
+        model: gives the parameters of the measurement chain, and the duty of a voltage.
         held_out: share of the recording at its end that models are not fitted to.
         fit_nominal: whether the rig is uncalibrated.
     """
@@ -91,34 +92,55 @@ def as_signals(read: Recording, sensing: Mapping[str, float], held_out: float = 
     if jumps:
         said = f"theta jumps by a turn {counted(jumps, 'time')}, from an end of its range to the other: joined"
         read = replace(read, theta=theta, notes=(*read.notes, said))
+    read = _with_known_direction(read, reverses=fit_nominal or model.model["reverse"] > 0.0)
     if not fit_nominal:
         check_period(read)
-        return from_recording(longest_piece(read), sensing, held_out)
+        if float(np.nanmin(read.duty, initial=0.0)) < -STILL and model.model["reverse"] == 0.0:
+            said = "the duty goes below 0: the bridge of this model brakes there (its parameter `reverse` is 0)"
+            read = replace(read, notes=(*read.notes, said))
+        piece = longest_piece(with_voltage_as_command(read, model.model["v_full"]) if model.model["v_full"] else read)
+        return from_recording(piece, model.sensing, held_out)
     if len(read) < FEWEST:
         raise RecordingError(f"{read.path}: {len(read)} samples are too few for a verdict")
-    return from_uncalibrated(longest_piece(with_voltage_as_command(read)), sensing, held_out)
+    return from_uncalibrated(longest_piece(with_voltage_as_command(read)), model.sensing, held_out)
 
 
-def with_voltage_as_command(read: Recording) -> Recording:
-    """A recording without commands whose voltage was measured: the voltage over the largest one is its duty.
+def _with_known_direction(read: Recording, *, reverses: bool) -> Recording:
+    """A recording without the speed of a rotor that is driven both ways, if the readings do not tell its direction."""
+    backward = float(np.nanmin(read.duty, initial=0.0)) < -STILL
+    if not (backward and reverses and np.isfinite(read.omega).any() and np.nanmin(read.omega) >= 0.0):
+        return read
+    said = "omega: the motor is driven both ways, and its speed is read without a sign: left out"
+    return replace(read, omega=np.full(len(read.omega), np.nan), notes=(*read.notes, said))
+
+
+def with_voltage_as_command(read: Recording, full: float | None = None) -> Recording:
+    """A recording without commands whose voltage was measured: the voltage over that of full duty is its duty.
+
+    Args:
+        read: the recording.
+        full: [V] voltage of full duty; the largest one if it is not given.
 
     Raises:
-        RecordingError: the voltage goes both ways; one line that says what to do.
+        RecordingError: the voltage is larger; one line that says what to do.
     """
     v = read.v_a
     known = np.isfinite(v)
     if np.isfinite(read.duty).any() or known.sum() <= FEWEST:
         return read
     noise = reading_noise_at((read.stamp_ns - read.stamp_ns[0]) * 1e-9, v)
-    top, bottom = float(v[known].max()), float(v[known].min())
-    if top - bottom <= MOVES * noise:
+    bottom, largest = float(v[known].min()), float(np.abs(v[known]).max())
+    if float(np.ptp(v[known])) <= MOVES * noise:
         return read
-    if bottom < -max(MOVES * noise, BACKWARDS * top):
-        raise RecordingError(f"{read.path}: the voltage goes from {bottom:.3g} to {top:.3g} V: the model's motor is "
-                             "driven one way; record with voltages of one sign")
-    said = (f"no command was recorded: the voltage over its largest value, {top:.3g} V, takes its place; nothing is "
-            "said of bridge and supply")
-    return replace(read, duty=np.clip(v / top, 0.0, 1.0), v_a=np.full(len(v), np.nan), notes=(*read.notes, said))
+    top = largest if full is None else full
+    if largest > top + MOVES * noise:
+        raise RecordingError(f"{read.path}: the voltage reaches {largest:.3g} V, more than the {top:.3g} V of full "
+                             "duty: correct v_full in the model file")
+    low = -1.0 if bottom < -max(MOVES * noise, BACKWARDS * top) else 0.0
+    of = "its largest value" if full is None else "that of full duty"
+    said = (f"no command was recorded: the voltage over {of}, {top:.3g} V, takes its place; nothing is said of bridge "
+            "and supply")
+    return replace(read, duty=np.clip(v / top, low, 1.0), v_a=np.full(len(v), np.nan), notes=(*read.notes, said))
 
 
 def from_recording(read: Recording, sensing: Mapping[str, float], held_out: float = 0.3) -> Signals:
@@ -153,7 +175,7 @@ def from_uncalibrated(read: Recording, sensing: Mapping[str, float], held_out: f
     if not np.isfinite(read.theta).any():
         raise RecordingError(f"{read.path}: no arm angle was measured (joint_states, position of 'arm'); nothing "
                              "to compare")
-    driven = np.isfinite(read.duty).any() and float(np.nanmax(read.duty)) >= STILL
+    driven = np.isfinite(read.duty).any() and float(np.nanmax(np.abs(read.duty))) >= STILL
     alone = not any(np.isfinite(getattr(read, c)).any() for c in ("omega", "i_a", "v_a"))
     index, period = irregular_grid(read.stamp_ns, LONGEST_PERIOD if driven and alone else math.inf)
     columns = _columns(read, index)
@@ -214,7 +236,7 @@ def with_commands(duty: Array, read: Recording, index: NDArray[np.int64]) -> Arr
         index: (M,) of each sample on the grid.
     """
     taken = np.isfinite(read.command)
-    times, commands = read.command_ns[taken], np.clip(read.command[taken], 0.0, 1.0)
+    times, commands = read.command_ns[taken], np.clip(read.command[taken], -1.0, 1.0)
     missing = ~np.isfinite(duty)
     if not missing.any() or len(times) < 2:
         return duty

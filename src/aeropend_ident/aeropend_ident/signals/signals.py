@@ -55,7 +55,7 @@ class Signals:
 
     Attributes:
         period: [s] between samples.
-        duty: (N,) applied duty, 0 to 1, held where a sample is missing.
+        duty: (N,) applied duty, 0 to 1, or -1 to 1 if the motor is driven both ways, held where a sample is missing.
         theta: [rad] (N,) arm angle, NaN where missing; likewise:
         omega: [rad/s] (N,) rotor speed.
         i_a: [A] (N,) armature current.
@@ -121,9 +121,14 @@ class Signals:
         return math.ceil(CATALOGUE["command_delay"].parameters["delay"].high / self.period) + 1
 
     @property
+    def both_ways(self) -> bool:
+        """Whether the motor is driven in both directions."""
+        return bool(np.min(self.duty) < 0.0)
+
+    @property
     def driven(self) -> bool:
         """Whether a duty acts at any time."""
-        return bool(np.max(self.duty) >= STILL)
+        return bool(np.max(np.abs(self.duty)) >= STILL)
 
     def channel(self, name: str) -> Array:
         """A measured channel (N,) by name."""

@@ -102,11 +102,11 @@ class Given:
 
     Attributes:
         supply: the voltage of the supply, so that a command in volts can be used.
-        clip: what to do with a command that goes both ways.
+        both_ways: what a command below 0 does.
     """
 
     supply: bool = False
-    clip: bool = False
+    both_ways: bool = False
 
 
 def guess(table: Table, given: Given | None = None) -> list[Guess]:
@@ -530,8 +530,9 @@ def _command_scale(one: _Seen, given: Given) -> scales.Scale:
     else:
         unit, why, sure = scales.of_command(np.abs(x) if low < 0.0 else x, list(one.words), counts=one.counts)
     if low < 0.0 and -low > 0.005 * top:
-        why += f"; it goes both ways, {low:.4g} to {top:.4g}" + ": add --both-ways clip" * (not given.clip)
-        sure = sure and given.clip
+        why += f"; it goes both ways, {low:.4g} to {top:.4g}" + ": add --both-ways reverse, brake or clip" * (
+            not given.both_ways)
+        sure = sure and given.both_ways
     return unit, why, sure
 
 

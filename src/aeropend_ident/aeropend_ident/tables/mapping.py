@@ -64,7 +64,7 @@ class Plan:
         clock: one of `clock.CLOCKS`.
         skip_bad: skip rows that cannot be read.
         supply: the voltage of the supply, "12V", for a duty in volts.
-        both_ways: "clip": set what is below 0 in the duty to 0; "" refuses it.
+        both_ways: what a duty below 0 does: "reverse" the motor; "brake" it, or "clip": set it to 0; "" refuses it.
     """
 
     time: str | None = None
@@ -394,21 +394,27 @@ def _duty(table: Table, chosen: tuple[int, Unit], raw: Floats, plan: Plan, notes
     unit = chosen[1]
     duty = unit.size * (raw - unit.low)
     backward = int((duty < -CLIPPED).sum())
-    if plan.both_ways == "clip" and backward:
-        notes.append(f"duty: {counted(backward, 'row')} of {len(duty)} below 0, down to "
-                     f"{100.0 * float(np.nanmin(duty)):.3g} %, set to 0 (as you say)")
+    down = f"duty: {counted(backward, 'row')} of {len(duty)} below 0, down to {100.0 * float(np.nanmin(duty)):.3g} %"
+    least = 0.0
+    if plan.both_ways == "reverse" and backward:
+        notes.append(f"{down}: they reverse the motor (as you say)")
+        least = -1.0
+    elif plan.both_ways and backward:
+        notes.append(f"{down}, set to 0 (as you say)" + ": the motor brakes" * (plan.both_ways == "brake"))
         duty = np.maximum(duty, 0.0)
     low, high = float(np.nanmin(duty)), float(np.nanmax(duty))
-    if low < -CLIPPED or high > 1.0 + CLIPPED:
-        worst = float(np.nanmin(raw)) if low < -CLIPPED else float(np.nanmax(raw))
-        why = (f"the motor of the model turns one way only; --both-ways clip sets {counted(backward, 'row')} of "
-               f"{len(duty)} to 0" if low < -CLIPPED and high <= 1.0 + CLIPPED else "is its unit right?")
+    if low < least - CLIPPED or high > 1.0 + CLIPPED:
+        worst = float(np.nanmin(raw)) if low < least - CLIPPED else float(np.nanmax(raw))
+        turned = -1.0 - CLIPPED <= low < least - CLIPPED and high <= 1.0 + CLIPPED
+        why = (f"does it reverse the motor in {counted(backward, 'row')} of {len(duty)} (--both-ways reverse), brake "
+               "it (brake), or do nothing (clip)?") if turned else "is its unit right?"
         raise TableError(f"{table.path}: column {table.label(chosen[0])} as a duty in {unit.text} goes to {worst:g}, "
-                         f"outside 0..100 %: {why}")
-    outside = int(((duty < 0.0) | (duty > 1.0)).sum())
+                         f"outside {100.0 * least:g}..100 %: {why}")
+    outside = int(((duty < least) | (duty > 1.0)).sum())
     if outside:
-        notes.append(f"duty: {counted(outside, 'row')} outside 0..100 % by less than {100.0 * CLIPPED:g} %: clipped")
-    return np.clip(duty, 0.0, 1.0)
+        notes.append(f"duty: {counted(outside, 'row')} outside {100.0 * least:g}..100 % by less than "
+                     f"{100.0 * CLIPPED:g} %: clipped")
+    return np.clip(duty, least, 1.0)
 
 
 def _described(table: Table, plan: Plan, chosen: dict[str, tuple[int, Unit]], channels: dict[str, Floats],

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Duty to voltage to speed to thrust in steady state, and the inverse functions for the controllers.
 
-All functions take and return scalars or arrays of one shape, in SI units. A duty is a fraction 0..1. `numbers` are the
+All functions take and return scalars or arrays of one shape, in SI units. A duty is a fraction 0..1, or -1..1 if the
+bridge reverses or brakes the motor. `numbers` are the
 parameters of the model by name, from `Model.numbers`.
 """
 
@@ -21,16 +22,31 @@ Numbers = Mapping[str, float]
 
 
 def voltage(numbers: Numbers, duty: ArrayLike) -> Array:
-    """Voltage (V) that a duty gives: v = max(0, k0 + k1 sqrt(k2 τ + k3)), thesis (4.3)."""
+    """Voltage (V) that a duty gives: v = max(0, k0 + k1 sqrt(k2 τ + k3)), thesis (4.3), or v = v_full τ.
+
+    For a duty below 0 it is -reverse v(|τ|). With `reverse` 0 the terminals are then shorted: the motor brakes.
+    """
     duty = np.asarray(duty, dtype=float)
-    return np.maximum(0.0, numbers["k0"] + numbers["k1"] * np.sqrt(numbers["k2"] * duty + numbers["k3"]))
+    size, full = np.abs(duty), numbers.get("v_full", 0.0)
+    v = full * size if full > 0.0 else (
+        np.maximum(0.0, numbers["k0"] + numbers["k1"] * np.sqrt(numbers["k2"] * size + numbers["k3"])))
+    return np.where(duty < 0.0, -numbers.get("reverse", 0.0) * v, v)
 
 
 def duty(numbers: Numbers, voltage: ArrayLike) -> Array:
-    """Duty that gives a voltage (V), clipped to 0..1. At 0 V and below it is 0, the dead zone of the map."""
+    """Duty that gives a voltage (V), clipped to its range. At 0 V, the dead zone of the map, it is 0.
+
+    So it is below 0 V, unless the bridge reverses the motor.
+    """
     v = np.asarray(voltage, dtype=float)
-    root = np.maximum(0.0, (v - numbers["k0"]) / numbers["k1"])
-    return np.where(v <= 0.0, 0.0, np.minimum(np.maximum((root * root - numbers["k3"]) / numbers["k2"], 0.0), 1.0))
+    reverse, full = numbers.get("reverse", 0.0), numbers.get("v_full", 0.0)
+    size = np.where(v < 0.0, -v / reverse if reverse > 0.0 else 0.0, v)
+    if full > 0.0:
+        found = np.minimum(size / full, 1.0)
+    else:
+        root = np.maximum(0.0, (size - numbers["k0"]) / numbers["k1"])
+        found = np.minimum(np.maximum((root * root - numbers["k3"]) / numbers["k2"], 0.0), 1.0)
+    return np.where(size <= 0.0, 0.0, np.where(v < 0.0, -found, found))
 
 
 def thrust(numbers: Numbers, speed: ArrayLike) -> Array:
@@ -58,11 +74,11 @@ def voltage_at(numbers: Numbers, speed: ArrayLike) -> Array:
 
 
 def speed_at(numbers: Numbers, voltage: ArrayLike) -> Array:
-    """Steady speed (rad/s) of an armature voltage (V >= 0): the inverse of `voltage_at`."""
+    """Steady speed (rad/s) of an armature voltage (V): the inverse of `voltage_at`."""
     v = np.asarray(voltage, dtype=float)
     a = numbers["R_a"] * numbers["k_load"] / numbers["K_t"]
     b = numbers["R_a"] * numbers["B_m"] / numbers["K_t"] + numbers["K_e"]
-    return 2.0 * v / (b + np.sqrt(b * b + 4.0 * a * np.maximum(v, 0.0)))
+    return 2.0 * v / (b + np.sqrt(b * b + 4.0 * a * np.abs(v)))
 
 
 def voltages(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, float]],
@@ -113,7 +129,7 @@ def _over_hold(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str,
             time = (start + np.arange(n)) * period
             v = v * np.maximum(0.0, 1.0 - effects["supply_drift"]["rate"] * time)
         if "bridge_drop" in effects:
-            v = np.maximum(0.0, v - effects["bridge_drop"]["v_drop"])
+            v = np.sign(v) * np.maximum(0.0, np.abs(v) - effects["bridge_drop"]["v_drop"])
         return v
 
     delay = effects["command_delay"]["delay"] / period if "command_delay" in effects else 0.0

@@ -672,7 +672,7 @@ def steps_in(model: Model, period: float) -> int:
         period: [s] length of the hold.
     """
     n, e = model.numbers(), values(model.effects)
-    top_speed = max(n["k0"] + n["k1"] * math.sqrt(n["k2"] + n["k3"]), 0.0) / n["K_e"]  # rad/s, never reached
+    top_speed = float(actuator.voltage(n, 1.0)) / n["K_e"]  # rad/s, never reached
     back = n["K_t"] * n["K_e"] / (n["J_m"] * n["L_a"])  # 1/s²: the speed acts back on itself through the winding
     rates = [1.0 / LONGEST_STEP,
              min(math.sqrt(back / 0.04), back * n["L_a"] / (0.02 * n["R_a"])),

@@ -136,7 +136,7 @@ def squared_errors(models: Sequence[Model], duty: Array, measured: Array, period
     """Sums of squared errors of many nominal models against one recording, on every core.
 
     Args:
-        models: M models; of their effects only `parameter_mismatch` is allowed.
+        models: M models; of their effects only `parameter_mismatch` is allowed, of their duty maps that of k0 to k3.
         duty: (N,) 0..1, held.
         measured: (4, N) θ, ω, i_a, v_a in SI units, without NaN.
         period: [s] time between samples.

@@ -55,8 +55,8 @@ class Excitation:
             (self.kind not in KINDS, f"kind is '{self.kind}': give one of {', '.join(KINDS)}"),
             (self.duration < SAMPLE_PERIOD, f"duration is {self.duration:g} s: give at least one sample, 0.00204 s"),
             (
-                not 0.0 <= self.duty_min < self.duty_max <= 1.0,
-                f"duty_min {self.duty_min:g} and duty_max {self.duty_max:g}: give 0 <= duty_min < duty_max <= 1",
+                not -1.0 <= self.duty_min < self.duty_max <= 1.0,
+                f"duty_min {self.duty_min:g} and duty_max {self.duty_max:g}: give -1 <= duty_min < duty_max <= 1",
             ),
             (
                 not SAMPLE_PERIOD <= self.hold_min <= self.hold_max,
@@ -64,10 +64,10 @@ class Excitation:
             ),
             (self.levels < 2, f"levels is {self.levels}: give at least 2"),
             (self.rest < 0.0, f"rest is {self.rest:g} s: give 0 or more"),
-            (not 0.0 <= self.duty <= 1.0, f"duty is {self.duty:g}: give 0 to 1"),
+            (not -1.0 <= self.duty <= 1.0, f"duty is {self.duty:g}: give -1 to 1"),
             (
-                not self.sequence or not all(0.0 <= duty <= 1.0 for duty in self.sequence),
-                "sequence: give at least one duty, each 0 to 1",
+                not self.sequence or not all(-1.0 <= duty <= 1.0 for duty in self.sequence),
+                "sequence: give at least one duty, each -1 to 1",
             ),
             (
                 not self.frequencies or not all(0.0 < frequency < nyquist for frequency in self.frequencies),

@@ -65,6 +65,8 @@ PARAMETERS: dict[str, Parameter] = {
     "model.mgd_over_J": _P("1/s²", 0.0, 1e4, "gravity on the arm over its inertia"),
     "model.c_over_J": _P("1/s", 0.0, 1e3, "viscous friction of the pivot over the arm's inertia"),
     "model.L_over_J": _P("1/(kg·m)", 0.0, 1e5, "lever of the thrust over the arm's inertia"),
+    "model.v_full": _P("V", 0.0, 1e3, "bridge without losses: v = v_full τ; 0 = the map of k0 to k3"),
+    "model.reverse": _P("-", 0.0, 1.0, "share of the voltage that a duty below 0 gives in reverse; 0 = it brakes"),
     "sensing.angle_lsb": _P("rad", 0.0, 1.0, "resolution of the angle; 0 = continuous"),
     "sensing.angle_filter_tau": _P("s", 0.0, 1.0, "each of two equal first-order stages of the angle filter; 0 = none"),
     "sensing.angle_noise": _P("rad", 0.0, 1.0, "standard deviation before quantisation"),
@@ -77,6 +79,13 @@ PARAMETERS: dict[str, Parameter] = {
     "sensing.speed_noise": _P("rad/s", 0.0, 1e3, "standard deviation of a speed reading"),
 }
 """All parameters of a model file outside `effects`, as `section.name`."""
+
+
+OPTIONAL = ("model.v_full", "model.reverse")
+"""Parameters that a model file may leave out: they are 0 then."""
+
+DUTY_MAP = ("model.k0", "model.k1", "model.k2", "model.k3")
+"""Parameters that a model file with `v_full` may leave out: it has no use for them, and they are 0."""
 
 
 def parameter(name: str) -> Parameter:
@@ -168,6 +177,9 @@ def from_flat(flat: Mapping[str, object], name: str = "model", base: Model | Non
             numbers[key] = _number(key, value, p.low, p.high, p.unit, name)
         else:
             raise _unknown("parameter", key, tuple(PARAMETERS), name)
+    numbers = {**dict.fromkeys(OPTIONAL, 0.0), **numbers}
+    if numbers["model.v_full"] > 0.0:
+        numbers |= dict.fromkeys(DUTY_MAP, 0.0)
     missing = [key for key in PARAMETERS if key not in numbers]
     if missing:
         raise ModelError(f"{name}: {missing[0]} is missing ({len(missing)} in all); "
@@ -204,11 +216,17 @@ def _read_effect(effects: dict[str, dict[str, float]], rest: str, value: object,
 
 def to_flat(model: Model) -> dict[str, float]:
     """The inverse of `from_flat`: dotted name -> value."""
-    flat = {f"model.{key}": value for key, value in model.model.items()}
+    flat = {f"model.{key}": value for key, value in _given(model).items()}
     flat.update({f"sensing.{key}": value for key, value in model.sensing.items()})
     flat.update({f"effects.{id_}.{key}": value
                  for id_, parameters in model.effects.items() for key, value in parameters.items()})
     return flat
+
+
+def _given(model: Model) -> dict[str, float]:
+    """The parameters of the plant that a file must give, and the others where they are not 0."""
+    left_out = {*OPTIONAL, *(DUTY_MAP if model.model.get("v_full", 0.0) > 0.0 else ())}
+    return {key: value for key, value in model.model.items() if value != 0.0 or f"model.{key}" not in left_out}
 
 
 def flatten(tree: Mapping[str, object], prefix: str = "") -> dict[str, object]:
@@ -322,7 +340,7 @@ def save(model: Model, path: str | Path, comment: str = "") -> None:
     Raises:
         ModelError: the file cannot be written. An old file is then unchanged.
     """
-    tree: dict[str, object] = {"model": dict(model.model), "sensing": dict(model.sensing)}
+    tree: dict[str, object] = {"model": _given(model), "sensing": dict(model.sensing)}
     if model.effects:  # rcl's parser refuses an empty mapping
         tree["effects"] = {id_: dict(parameters) for id_, parameters in model.effects.items()}
     head = "".join(f"# {printable(line)}\n" for line in comment.splitlines())

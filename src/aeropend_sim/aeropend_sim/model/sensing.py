@@ -284,7 +284,10 @@ def read(out: Array, truth: Array, normal: Array, uniform: Array, m: Memory, fir
             first = False
         else:
             last, speed, now = m.last_pulse, m.speed, m.time + c.h
-            if c.pulses > 0.0:
+            if c.pulses > 0.0 and angle < m.rotor_angle:  # a pulse does not tell the direction
+                before = Memory(m.stage1, m.stage2, m.theta, m.theta_dot, -m.omega, -m.rotor_angle, last, speed, m.time)
+                last, speed, now = time_pulses(before, -omega, -angle, uniform[k], normal[k, 1], c)
+            elif c.pulses > 0.0:
                 last, speed, now = time_pulses(m, omega, angle, uniform[k], normal[k, 1], c)
             stage1, stage2 = filter_angle(m, theta, theta_dot, c)
             m = Memory(stage1, stage2, theta, theta_dot, omega, angle, last, speed, now)

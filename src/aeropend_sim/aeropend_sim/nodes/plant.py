@@ -171,6 +171,7 @@ class Plant(RigInterface):
         self._rig = Rig(model, settings["seed"])
         self._rig.run(np.zeros(1))  # compiles before the first deadline
         self._rig.reset()
+        self.lowest = -1.0 if model.numbers()["reverse"] > 0.0 else 0.0
         self._speed: float = settings["speed"]
         self._samples = 0
         self._lost = 0

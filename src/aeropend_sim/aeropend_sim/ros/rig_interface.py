@@ -27,6 +27,7 @@ class RigInterface(Node):
         lock: guards the attributes that follow, and whatever else the callbacks and the sampling thread share.
         duty: duty that the rig is to apply.
         enabled: whether commands act.
+        lowest: the least duty: 0, or -1 for a bridge that drives the motor both ways.
         refused: number of commands that were not finite numbers.
         clock_steps: number of times that the system clock was set.
         to_ros_ns: [ns] system time minus the monotonic clock.
@@ -37,6 +38,7 @@ class RigInterface(Node):
         self.lock = threading.Lock()
         self.duty = 0.0
         self.enabled = True
+        self.lowest = 0.0
         self.refused = 0
         self.clock_steps = 0
         self.to_ros_ns = monotonic_to_ros_ns()
@@ -55,7 +57,7 @@ class RigInterface(Node):
         """Apply a commanded duty, or ignore it. The lock is held.
 
         Args:
-            duty: 0..1.
+            duty: `lowest`..1.
         """
         raise NotImplementedError
 
@@ -96,7 +98,7 @@ class RigInterface(Node):
                 self.get_logger().warn(f"duty_command {message.data} refused; further ones are only counted")
             return
         # as the 32-bit float that `armature` reports, so that a recording holds exactly the duty that acted
-        duty = ctypes.c_float(min(max(message.data, 0.0), 1.0)).value
+        duty = ctypes.c_float(min(max(message.data, self.lowest), 1.0)).value
         with self.lock:
             self.take_duty(duty)
 

@@ -70,7 +70,8 @@ class CutChain:
         none = np.zeros(len(signals))
         p = signals.pulses
         if p is not None and signals.has("v_a"):  # the timing of a slow pulse is more precise than the motor's voltage
-            unsure = signals.sigma["v_a"] * math.sqrt(len(STAGES["actuator"]) / signals.train) / model.model["K_e"]
+            fitted = sum(model.model[name] != 0.0 for name in STAGES["actuator"])
+            unsure = signals.sigma["v_a"] * math.sqrt(fitted / signals.train) / model.model["K_e"]
             signals = replace(signals, pulses=replace(p, sigma=np.hypot(p.sigma, unsure)))
         chain = cls(model, signals, none, none, none)
         chain.set_motor_input({})
@@ -205,7 +206,11 @@ class CutChain:
         elif s.has("omega"):
             clean = partial(slow_part, width=round(SPEED_SETTLES / s.period), sigma=s.sigma["omega"])
             omega = omega + split_apply(clean, s.true_speed - omega, s.train)
-        self.speed = np.maximum(omega, 0.0)
+        self.speed = self._turning(omega)
+
+    def _turning(self, omega: Array) -> Array:
+        """A speed (N,) that is at least 0, unless the motor is driven both ways."""
+        return omega if self.signals.both_ways else np.maximum(omega, 0.0)
 
     # --- arm: speed -> angle
 
@@ -225,7 +230,7 @@ class CutChain:
         if not cut and not s.duty.any() and "initial.omega" not in values and actuator.voltage(n, 0.0) == 0.0:
             speed = np.zeros(len(s))[:stop]  # the rotor stands
         else:
-            speed = self.speed[:stop] if cut else np.maximum(self.motor(values, stop)[1], 0.0)
+            speed = self.speed[:stop] if cut else self._turning(self.motor(values, stop)[1])
         state = dynamics.State(omega=float(speed[0]), theta=values.get("initial.theta", 0.0),
                                theta_dot=values.get("initial.theta_dot", 0.0),
                                thrust=float(actuator.thrust(n, speed[0])))

@@ -42,12 +42,13 @@ from aeropend_ident.diagnosis.chain.weak_start import (
 )
 from aeropend_ident.diagnosis.policy import Policy, angle_only, policy_of
 from aeropend_ident.estimation.map_fit import Fit, fit
+from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.free_decay import turning_points
 from aeropend_ident.signals.noise import resolution
 from aeropend_ident.signals.signals import Signals
 from aeropend_ident.signals.smoothing import block_mean
 from aeropend_sim.model import dynamics
-from aeropend_sim.model.parameters import Model
+from aeropend_sim.model.parameters import DUTY_MAP, Model
 
 Array = NDArray[np.float64]
 
@@ -109,11 +110,28 @@ def _stage_by_stage(model: Model, recordings: Sequence[Signals], policy: Policy)
             chains = _cut_again(chains, _start_of_motor(chains))
         elif stage == "arm":
             chains = _cut_again(chains, _start_of_arm(chains))
-        parameters = nominal_parameters(chains, stage)
-        f = fit(chains.residuals(stage), [replace(p, sd=WIDER * p.sd) for p in parameters])
+        chains, f = _likelier([chains, *_without_losses(chains)] if stage == "actuator" else [chains], stage)
         if f.residuals:
             chains = _cut_again(chains, chains.each[0].valued(of_rig(f.values)))
     return chains.model
+
+
+def _likelier(tried: Sequence[CutChains], stage: str) -> tuple[CutChains, Fit]:
+    """The chains with the largest evidence in a stage, and their fit."""
+    fits = [fit(c.residuals(stage), [replace(p, sd=WIDER * p.sd) for p in nominal_parameters(c, stage)]) for c in tried]
+    return max(zip(tried, fits, strict=True), key=lambda pair: pair[1].log_evidence(fits[0].ess))
+
+
+def _without_losses(chains: CutChains) -> list[CutChains]:
+    """The same with a bridge without losses, if the voltage was measured."""
+    known = [np.isfinite(s.v_a) for s in chains.recordings]
+    duty = np.concatenate([np.abs(s.duty[k]) for s, k in zip(chains.recordings, known, strict=True)])
+    v = np.concatenate([np.abs(s.v_a[k]) for s, k in zip(chains.recordings, known, strict=True)])
+    full = float(duty @ v) / max(float(duty @ duty), 1e-12)
+    if full <= 0.0:
+        return []
+    numbers = {**chains.model.model, **{key(name).name: 0.0 for name in DUTY_MAP}, "v_full": full}
+    return [_cut_again(chains, replace(chains.model, model=numbers))]
 
 
 def _cut_again(chains: CutChains, model: Model) -> CutChains:
@@ -184,7 +202,8 @@ def _start_of_arm(chains: CutChains) -> Model:
     for chain, s in zip(chains.each, coarse):
         every = max(1, round(s.period / chain.signals.period))
         speed = chain.speed if chain.signals.has("omega") or chain.signals.has("i_a") else chain.motor({})[1]
-        lifts.append(np.maximum(speed[::every][:len(s.theta)], 0.0) ** 2)
+        turning = speed if chain.signals.both_ways else np.maximum(speed, 0.0)
+        lifts.append((turning * np.abs(turning))[::every][:len(s.theta)])
     tests = [WeakForm(replace(s, duty=np.zeros(len(s.theta)))) for s in coarse]
     r = regress(tests, lifts)
     if r.gravity <= 0.5 or r.gain <= 0.0:

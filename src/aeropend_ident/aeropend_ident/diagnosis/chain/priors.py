@@ -90,6 +90,9 @@ Derived: a factor of four is two standard deviations, ln(4)/2."""
 FINDINGS = ("coulomb_friction",)
 """Effects that are identified with the nominal model but reported as missing in it (choice: as in a free decay)."""
 
+REVERSE_SD = 0.3
+"""Standard deviation of the share of the voltage that an uncalibrated bridge gives in reverse (choice: about alike)."""
+
 SIZE_SD = 3.0
 """Standard deviation of an effect's size, in default sizes: rigs may show several times the default (choice).
 
@@ -198,11 +201,12 @@ def _of_angle(model: Model, recordings: Sequence[Signals]) -> list[Parameter]:
     if free_swinging(recordings):
         return [*arm, Parameter(ZERO, model.effect("angle_offset", "bias"), 0.3)]
     own = [_of_effect(name, model) for name in held(model)]
-    full = max(float(actuator.voltage(m, max(float(s.duty.max()) for s in recordings))), LEAST_VOLTAGE)
+    full = max(float(actuator.voltage(m, max(float(np.abs(s.duty).max()) for s in recordings))), LEAST_VOLTAGE)
     heaviest = HEAVIEST * (1.0 + HEAVIEST) * m["K_e"] ** 2 * m["K_t"] / (m["R_a"] * full)
     quickest = max(QUICKEST * slower, 0.6 * max(s.period for s in recordings)) * m["K_t"] * m["K_e"] / m["R_a"]
     rest = -m["k1"] * math.sqrt(m["k3"])  # a duty of 0 does not turn the rotor
-    return [*arm, log("L_over_J", 0.7), Parameter("k0", min(m["k0"], rest), 0.5, -10.0, rest),
+    reverse = [Parameter("reverse", m["reverse"], REVERSE_SD, 0.0, 1.0)] if m["reverse"] > 0.0 else []
+    return [*arm, *reverse, log("L_over_J", 0.7), Parameter("k0", min(m["k0"], rest), 0.5, -10.0, rest),
             replace(log("k3", 1.5), high=STRAIGHT * m["k2"]), replace(log("k_load", 1.0), high=heaviest),
             replace(log("J_m", 0.7), low=quickest), _filter(model), *own]
 
@@ -267,7 +271,7 @@ def state_of_arm(model: Model, s: Signals, recording: int = 0) -> list[Parameter
     zero = model.effect("angle_offset", "bias")
     found = [Parameter(_initial("theta", recording), float(angle) - zero, 0.3),
              Parameter(_initial("theta_dot", recording), float(rate), 5.0)]
-    if s.driven and not s.has("omega") and float(s.duty[0]) >= STILL:
+    if s.driven and not s.has("omega") and abs(float(s.duty[0])) >= STILL:
         n = model.numbers()  # thrust holds the arm at its first angle; for an arm that hangs the rotor still stands
         held = max(n["mgd_over_J"] * math.sin(float(angle) - zero), 0.0) / n["L_over_J"]
         speed = float(actuator.speed(n, held))

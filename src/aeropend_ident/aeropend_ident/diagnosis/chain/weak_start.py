@@ -139,7 +139,7 @@ def unit_lift(model: Model, s: Signals) -> Array:
     out = np.empty((3, len(v)))
     dynamics.run_motor(v, state, *dynamics.prepare(model.with_effects({}), s.period), out)
     pivot = dynamics.THRUST_PIVOT_SPEED
-    u = pivot**2 * (np.maximum(out[1], 0.0) / pivot) ** model.effect("thrust_exponent", "n")
+    u = np.sign(out[1]) * pivot**2 * (np.abs(out[1]) / pivot) ** model.effect("thrust_exponent", "n")
     tau = model.effect("thrust_lag", "tau")
     return smoothing.lag(u, tau, s.period, model.effect("thrust_lag", "fall")) if tau > 0.0 else u
 

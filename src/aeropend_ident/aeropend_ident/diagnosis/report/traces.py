@@ -149,7 +149,8 @@ def held_out(s: Signals) -> slice:
 
 def _figure(diagnosis: Diagnosis, k: int, document: DiagnosisDocument, figures: int) -> Figure:
     s = diagnosis.signals[k]
-    drawings = [_Drawing("duty", "duty", "the duty applied", {"duty": s.duty}, (0.0, 1.0))] if s.driven else []
+    reach = (-1.0 if s.both_ways else 0.0, 1.0)
+    drawings = [_Drawing("duty", "duty", "the duty applied", {"duty": s.duty}, reach)] if s.driven else []
     for channel in document.channels:
         if s.has(channel):
             drawings += _channel(diagnosis, k, channel)

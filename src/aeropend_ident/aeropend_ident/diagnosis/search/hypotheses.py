@@ -19,7 +19,7 @@ from aeropend_ident.diagnosis.chain.priors import (
     model_parameters,
     usual_size,
 )
-from aeropend_ident.diagnosis.chain.values import PLACE_OF_PARAMETER, STAGES, limits
+from aeropend_ident.diagnosis.chain.values import FEWEST_PARAMETERS, PLACE_OF_PARAMETER, STAGES, limits
 from aeropend_ident.diagnosis.policy import angle_only
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH, RANDOM
@@ -95,7 +95,7 @@ class Hypothesis:
     @property
     def log_odds(self) -> float:
         """Prior log odds against no further effect."""
-        return math.log(EFFECT_ODDS / (sum(map(len, STAGES.values())) if self.parameter else 1))
+        return math.log(EFFECT_ODDS / (FEWEST_PARAMETERS if self.parameter else 1))
 
 
 def hypotheses(model: Model, *, mismatches: bool = True, known: Known | None = None) -> list[Hypothesis]:
