@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from aeropend_ident.diagnosis.chain.driven_rig import Units, fit_driven_rig, fit_own, units_of
+from aeropend_ident.diagnosis.chain.hanging import mounted
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.signals.from_bag import end_of_motion
 from aeropend_ident.signals.signals import Signals, from_arrays
@@ -99,14 +100,34 @@ def test_a_term_that_the_free_run_does_not_need_is_left_out():
     assert fit_own(found, [driven()]).mean_square < 1.2
 
 
-@pytest.mark.promise("Uncalibrated rigs", "An angle of the wrong sign gives no verdict, and the reason")
-def test_an_angle_that_falls_while_the_duty_lifts_gives_no_effect():
-    found = diagnose(BENCH, [driven(sign=-1.0)], 2, fit_nominal=True)
-    body = found.body
-    assert body["which"]["verdict"] == "cannot_tell"
-    assert body["which"]["effects"] == []
-    assert not any("do not tell" in note for note in found.signals[0].notes)
-    assert "sign" in body["which"]["unexplained"][0]
+@pytest.mark.promise("Uncalibrated rigs", "Zero and sign of the angle, whatever they are, are found from the motion")
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("zero", [-1.45, 0.8, 2.9, 6.9])
+def test_zero_and_sign_of_the_angle_are_found_from_the_motion(sign, zero):
+    s = driven(sign=sign)
+    (found,) = mounted(BENCH, [replace(s, theta=s.theta + zero)])
+    assert found.mounting.flipped == (sign < 0.0)
+    assert found.mounting.zero == pytest.approx(zero, abs=0.05)
+    assert any("hangs at a reading of" in note for note in found.notes)
+    assert any("its sign is turned" in note for note in found.notes) == (sign < 0.0)
+    assert np.abs(found.theta - driven().theta).max() < 0.06
+
+
+def test_an_angle_that_is_read_as_it_should_be_is_not_touched():
+    s = driven()
+    (found,) = mounted(BENCH, [s])
+    assert np.array_equal(found.theta, s.theta)
+    assert found.notes == s.notes
+
+
+def test_a_rig_read_upside_down_gives_the_verdict_of_the_rig():
+    effects = {"coulomb_friction": {"accel": 0.8}}
+    s = driven(effects=effects, sign=-1.0)
+    found = diagnose(BENCH, [replace(s, theta=s.theta - 1.45)], 2, fit_nominal=True)
+    assert found.conclusions.which.effects == ("coulomb_friction",)
+    identified = found.conclusions.identified
+    assert identified.mounting.flipped
+    assert identified.mounting.reading(0.0) == pytest.approx(-1.45, abs=0.05)
 
 
 @pytest.mark.promise("Uncalibrated rigs", "A model that does not predict the unseen part names no effect")

@@ -143,12 +143,16 @@ def test_nothing_is_overwritten_or_left_half_written(tmp_path, capsys):
     path = put(tmp_path, "t,x\n" + NUMBERS)
     (tmp_path / "bag").mkdir()
     assert "is there already" in refused(capsys, path, tmp_path / "bag", *MAPPED)
+    assert "is no recording, and is not replaced" in refused(capsys, path, tmp_path / "bag", *MAPPED, "--overwrite")
     assert not list((tmp_path / "bag").iterdir())
+    assert main([str(path), str(tmp_path / "made"), *MAPPED]) == 0
+    assert "or add --overwrite" in refused(capsys, path, tmp_path / "made", *MAPPED)
+    assert main([str(path), str(tmp_path / "made"), *MAPPED, "--overwrite"]) == 0
     assert "is a file: name the recording" in refused(capsys, path, path, *MAPPED)
     assert "cannot be written: Not a directory" in refused(capsys, path, path / "bag", *MAPPED)
     assert "name the recording to make" in refused(capsys, path, *MAPPED)
     assert "no such file" in refused(capsys, tmp_path / "none.csv", tmp_path / "new", *MAPPED)
-    assert sorted(one.name for one in tmp_path.iterdir()) == ["bag", "run.csv"]
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["bag", "made", "run.csv"]
 
 
 def test_encode_is_the_inverse_of_decode(bags):
@@ -180,3 +184,13 @@ def test_from_a_german_table_to_a_verdict(tmp_path):
     assert found["duration_s"] == pytest.approx(time[-1], abs=0.02)
     assert found["channels"]["theta"]["gap_after"] < math.radians(1.0)
     assert (tmp_path / "out" / "report.html").is_file()
+
+
+def test_what_is_said_of_a_column_goes_before_what_is_guessed(tmp_path, capsys):
+    path = put(tmp_path, "t,pot,u\n" + "".join(
+        f"{t:.4f},{512.0 + x / 0.264:.0f},{u:.2f}\n" for t, x, u in zip(LONG, DRIVEN, PUSH / 100.0)))
+    assert main([str(path), str(tmp_path / "bag"), "--accept"]) == 2
+    assert "0.264deg for a potentiometer of 270 degrees" in capsys.readouterr().out
+    recording = imported(tmp_path, path, "--accept", "--theta", "pot:0.264deg", "--zero", "512")
+    np.testing.assert_allclose(recording.theta, np.radians(DRIVEN), atol=np.radians(0.14))
+    np.testing.assert_allclose(recording.duty, PUSH / 100.0, atol=1e-6)

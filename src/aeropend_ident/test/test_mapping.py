@@ -141,7 +141,6 @@ def test_what_was_not_measured_is_not_there(tmp_path):
     ((*MAPPED, "--zero", "start"), "the arm moves by"),
     ((*MAPPED, "--rate", "50"), "contradict each other"),
     ((*MAPPED, "--motor-off", "--duty", "pwm:%"), "contradict each other"),
-    ((*MAPPED, "--accept"), "give one"),
     (("--rate", "-5", "--theta", "x:deg"), "is not a rate"),
     (("--rate", "50", "--theta", "x:deg", "--clock", "even"), "omit it"),
     ((*MAPPED, "--delimiter", "ab"), "cannot split cells"),

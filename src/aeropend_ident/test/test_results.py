@@ -54,8 +54,8 @@ def test_the_line_of_an_uncalibrated_rig():
             "c_over_J": ParameterRow(1.0, 1.5, 1.4, 1.6, determined=True, runs=(), run_to_run=0.25)}
     lift = Lift((0.0, 0.9), (0.0, 20.0), 0.1, 0.3)
     assert identified_line(Identified("the angle", ("R_a",), lift, HangingAngle(0.1, 0.0, 0.2)), rows) == (
-        "identified from the angle: c_over_J = 1.5 (1.4 to 1.6, run to run 0.25), hangs at 0.1 rad, lift up to 20.0 "
-        "rad/s² at a duty of 0.90, none below 0.10, with a lag of 0.30 s; not determined: R_a")
+        "identified from the angle: c_over_J = 1.5 (1.4 to 1.6, run to run 0.25) 1/s, hangs at a reading of 0.1 rad, "
+        "lift up to 20.0 rad/s² at a duty of 0.90, none below 0.10, with a lag of 0.30 s; not determined: R_a")
     slow = Lift((0.0, 0.9), (0.0, 20.0), 2.5e-16, 110.0)
     assert identified_line(Identified("the angle", (), slow), {}, 60.0) == (
         "identified from the angle: lift up to 20.0 rad/s² at a duty of 0.90, with a lag longer than the recording")

@@ -29,6 +29,7 @@ from aeropend_ident.diagnosis.results import FILES, Results, document
 from aeropend_ident.diagnosis.validation import validate
 from aeropend_ident.result_folder import ensure_free, folder_names
 from aeropend_ident.signals.from_bag import signals_of
+from aeropend_ident.signals.signals import Mounting
 from aeropend_sim.cli import browser
 from aeropend_sim.cli.command import Parser, between, entry_point, own
 from aeropend_sim.cli.progress import progress
@@ -135,8 +136,12 @@ def run(options: argparse.Namespace, command: str) -> None:
         signals, tests = ([signals_of(bag, options.namespace, model, options.held_out,
                                       fit_nominal=uncalibrated) for bag in bags]
                           for bags in (options.bags, options.test))
+        if known is not None and (of_rig := verdicts[-1].identified) is not None:
+            signals = [(of_rig.mounting or Mounting()).of(s) for s in signals]
         found = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal, material=options.material,
                          seconds=options.seconds, known=known, progress=lambda what, share: show(share, what))
+        alike = found.signals[0].mounting or Mounting()
+        tests = [alike.of(s) for s in tests]
         shown = [Across(bag, **vars(validate(found.model, found.augmented, s))) for bag, s in zip(options.test, tests)]
         nominal = " and ".join(options.since) or options.model
         made = document(found, options.bags, nominal, time.monotonic() - started, shown)

@@ -11,7 +11,9 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -94,6 +96,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     more.add_argument("--sheet", metavar="NAME", help="sheet of a workbook with several tables")
     more.add_argument("--delimiter", type=_delimiter, metavar="MARK", help="between cells: , ; tab blank or another")
     more.add_argument("--decimal", choices=(".", ","), metavar="MARK", help="decimal mark: . or ,")
+    more.add_argument("--overwrite", action="store_true", help="replace the recording, if it is there already")
     more.add_argument("--skip-bad", action="store_true", help="skip rows that cannot be read")
     given = parser.parse_args(_joined(arguments))
     given.files, given.bag = [Path(path) for path in given.paths], None
@@ -111,9 +114,6 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         parser.error("--rate and --time contradict each other: give one")
     if given.rate is not None and given.clock != "auto":
         parser.error("--clock applies to stamps: omit it with --rate")
-    named = [quantity for quantity in UNITS if getattr(given, quantity)]
-    if given.accept and named:
-        parser.error(f"--accept and --{named[0]} contradict each other: give one")
     if given.others and len(given.files) > 1:
         parser.error("--with belongs to one file: import the others one by one")
     return given
@@ -160,16 +160,18 @@ def run(given: argparse.Namespace, arguments: Sequence[str]) -> int:
         raise TableError("name the recording to make, after the file")
     bags = [given.bag] if len(given.files) == 1 else [given.bag / file.stem for file in given.files]
     for bag in bags:
-        if bag is not None and bag.exists():
-            raise BagExistsError(f"{bag}: is there already: name another folder")
+        if bag is not None and bag.exists() and not (given.overwrite and (bag / "metadata.yaml").is_file()):
+            what = "is no recording, and is not replaced" if given.overwrite else "is there already"
+            raise BagExistsError(f"{bag}: {what}: name another folder" + ", or add --overwrite" * (not given.overwrite))
     for done, (file, bag) in enumerate(zip(given.files, bags)):
         try:
             with progress(f"reading {printable(file.name)}") as show:
                 table = _read(file, given)
-                now, unsure = plan, ""
-                if not plan.columns():
-                    found = guess(table, Given(plan.supply is not None, bool(plan.both_ways)))
-                    chosen = options(table, found)
+                now, unsure, said = plan, "", plan.columns()
+                if given.accept or not said:
+                    found = [Guess(why="as you say") if one.quantity in said else one
+                             for one in guess(table, Given(plan.supply is not None, bool(plan.both_ways)))]
+                    chosen = {**options(table, found), **said}
                     if plan.rate is not None:
                         chosen.pop("time", None)
                     if not given.accept or not _enough(chosen, found, plan):
@@ -180,7 +182,8 @@ def run(given: argparse.Namespace, arguments: Sequence[str]) -> int:
                 taken = samples(table, now)
                 assert bag is not None
                 show(0.0, f"writing {printable(bag.name)}")
-                write(bag, taken, about(file, arguments, taken), show)
+                with _put_aside(bag):
+                    write(bag, taken, about(file, arguments, taken), show)
         except (TableError, BagExistsError) as error:
             ready = f" ({counted(done, 'recording')} before it {'is' if done == 1 else 'are'} made)" if done else ""
             raise TableError(f"{error}{ready}") from None
@@ -189,6 +192,22 @@ def run(given: argparse.Namespace, arguments: Sequence[str]) -> int:
         tell(bag, file, taken)
         print(printable(unsure.rstrip()), end="\n" if unsure else "")
     return 0
+
+
+@contextmanager
+def _put_aside(bag: Path) -> Iterator[None]:
+    """A recording that is replaced stays until the new one is written, and comes back if that fails."""
+    if not bag.exists():
+        yield
+        return
+    with tempfile.TemporaryDirectory(dir=bag.parent, prefix=f".{bag.name}") as folder:
+        old = Path(folder) / bag.name
+        bag.rename(old)
+        try:
+            yield
+        except BaseException:
+            old.rename(bag)
+            raise
 
 
 def _read(file: Path, given: argparse.Namespace) -> Table:

@@ -30,7 +30,7 @@ from aeropend_ident.diagnosis.search.onset import Onset
 from aeropend_ident.diagnosis.search.selection import FORM_SHOWS, mean_square, squared_gap
 from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter, key
-from aeropend_ident.signals.signals import Signals
+from aeropend_ident.signals.signals import Mounting, Signals
 from aeropend_ident.signals.statistics import Z95
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import DUTY_MAP, MODEL_NAMES, OPTIONAL, PARAMETERS, Model
@@ -128,14 +128,21 @@ def identified_model(chains: CutChains, joint: JointFit, rows: Mapping[str, Para
     lift, hangs = None, None
     if "k3" in values and angle_only(recordings):
         lift = driven_rig.lift(with_values(chains.model, chains.values_of(values, 0)), recordings)
+    mounting = recordings[0].mounting or Mounting()
     if ZERO in values:
         one, own = interval(values[ZERO], joint.sd[ZERO]), _over_recordings(ZERO, values, joint.sd)
-        mean = one if own is None else own.mean
-        hangs = HangingAngle(mean.value, mean.low, mean.high, own.runs if own else None,
-                             own.run_to_run if own else None)
+        mean, *runs = (_reading(mounting, x) for x in ([one] if own is None else [own.mean, *own.runs]))
+        hangs = HangingAngle(mean.value, mean.low, mean.high, tuple(runs) or None, own.run_to_run if own else None)
     terms = [n for n in CHOSEN if n in values and n != ZERO and key(n).owner in chains.model.effects and lift]
     return Identified(basis(recordings), tuple(n for n, row in rows.items() if not row.determined), lift, hangs,
+                      None if mounting == Mounting() else mounting,
                       {n: _within_range(n, values[n], joint.sd[n]) for n in terms})
+
+
+def _reading(mounting: Mounting, theta: Interval) -> Interval:
+    """The reading of the sensor where the angle is one that the fits have, in rad."""
+    ends = sorted(mounting.reading(x) for x in (theta.low, theta.high))
+    return Interval(mounting.reading(theta.value), *ends)
 
 
 def candidates(joint: JointFit, statistical: Statistical, held_out: HeldOut, gap_after: float,
@@ -209,12 +216,13 @@ def _closes_as_much(chains: CutChains, stage: str, before: Fit, first: RankedHyp
                     ) -> bool:
     """Whether a rival closes as much of the gap as the first, while neither explains all.
 
-    What both leave may then decide between them. A parameter that is off only stands in for an effect.
+    What both leave may then decide between them, if it is more than that by which they differ. A parameter that is off
+    only stands in for an effect.
     """
     if rival.hypothesis.parameter or mean_square(first.fit, stage) < FORM_SHOWS:
         return False
     open_, best, left = (squared_gap(chains, f, CHANNELS_OF[stage]) for f in (before, first.fit, rival.fit))
-    return left - best < MATERIAL_SHARE * (open_ - best)
+    return left - best < min(MATERIAL_SHARE * (open_ - best), best)
 
 
 def names(first: RankedHypothesis, second: RankedHypothesis) -> tuple[str, str]:

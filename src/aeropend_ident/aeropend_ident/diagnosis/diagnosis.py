@@ -22,6 +22,7 @@ from aeropend_ident.diagnosis.chain import static_map
 from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.driven_rig import fit_driven_rig, fit_own, without_findings
+from aeropend_ident.diagnosis.chain.hanging import mounted
 from aeropend_ident.diagnosis.chain.known import Known
 from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model
 from aeropend_ident.diagnosis.chain.pwm_timing import with_pwm_timing
@@ -126,6 +127,7 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
             progress("identifying the nominal model", 0.0)
             if any(s.both_ways for s in recordings):
                 model = replace(model, model={**model.model, "reverse": 1.0})
+            recordings = mounted(model, recordings)
         if policy.wide_search and angle_only(recordings):
             rig = fit_driven_rig(model, recordings)
             found, likely = without_findings(rig.model, model, recordings, material)

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from aeropend_ident.diagnosis import typed_json
 from aeropend_ident.diagnosis.typed_json import JsonError
+from aeropend_ident.signals.signals import Mounting
 from aeropend_sim.errors import UserError
 
 CANNOT_TELL = "cannot_tell"
@@ -381,6 +382,7 @@ class Identified:
         not_determined: parameters that the recordings do not determine.
         lift: only where duty and angle are all that was measured.
         hangs_at: only where it was fitted.
+        mounting: of the angle's sensor, only where its zero or its sign was found from the motion.
         own: effects that the nominal model holds since a cross-validated free run needs them: name -> size.
     """
 
@@ -388,6 +390,7 @@ class Identified:
     not_determined: tuple[str, ...]
     lift: Lift | None = None
     hangs_at: HangingAngle | None = None
+    mounting: Mounting | None = None
     own: Mapping[str, Interval] = field(default_factory=dict)
 
 

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from aeropend_ident.diagnosis.chain.values import limits
 from aeropend_ident.diagnosis.diagnosis import Diagnosis
 from aeropend_ident.diagnosis.document import (
     CANNOT_TELL,
@@ -170,18 +171,23 @@ def identified_line(identified: Identified, rows: Mapping[str, ParameterRow], du
         duration: [s] of the recordings.
     """
     texts = [f"{n} = {plain(row.value)} ({plain(row.low)} to {plain(row.high)}"
-             + (f", run to run {plain(row.run_to_run, 2)})" if row.run_to_run else ")")
+             + (f", run to run {plain(row.run_to_run, 2)})" if row.run_to_run else ")") + _unit(n)
              for n, row in rows.items() if row.determined]
     if hangs := identified.hangs_at:
-        texts.append(f"hangs at {plain(hangs.value, 3)} rad"
+        texts.append(f"hangs at a reading of {plain(hangs.value, 3)} rad"
                      + (f" (run to run {plain(hangs.run_to_run, 2)})" if hangs.run_to_run else ""))
-    texts += [f"{n} = {plain(size.value, 3)} ({plain(size.low, 3)} to {plain(size.high, 3)})"
+    texts += [f"its own {n} = {plain(size.value, 3)} ({plain(size.low, 3)} to {plain(size.high, 3)}){_unit(n)}"
               for n, size in identified.own.items()]
     if identified.lift:
         texts.append(f"lift {_spaced(lift_text(identified.lift, duration))}")
     left = ", ".join(identified.not_determined)
     return (f"identified from {identified.basis}: {', '.join(texts) or 'nothing'}"
             + (f"; not determined: {left}" if left else ""))
+
+
+def _unit(name: str) -> str:
+    unit = limits(name).unit
+    return "" if unit == "-" else f" {unit}"
 
 
 def gap_line(name: str, closed: ClosedGap) -> str:
@@ -210,8 +216,8 @@ def budget_line(budget: GapBudget) -> str:
 
 
 def of_the_gap(share: Interval) -> str:
-    """A share of the gap with its 95 % interval: `62 % (55 to 70 %) of the gap`."""
-    return f"{plain_percent(share.value)} %{_between(share.low, share.high)} of the gap"
+    """A share of the gap with its 95 % interval: `62 % (55 to 70 %) of the squared gap`."""
+    return f"{plain_percent(share.value)} %{_between(share.low, share.high)} of the squared gap"
 
 
 def _between(low: float, high: float) -> str:

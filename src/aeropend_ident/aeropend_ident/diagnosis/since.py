@@ -59,8 +59,8 @@ def _known(verdict: DiagnosisDocument, folder: Path) -> Known:
     """The estimates of a verdict; the file may come from anywhere."""
     e, path = verdict.estimates, folder / "diagnosis.json"
     if e is None:
-        raise DocumentError(f"{path}: holds no estimates to compare with: the model could not be identified, or an "
-                            "older version wrote it; diagnose the recording again")
+        raise DocumentError(f"{path}: holds no estimates to compare with: the report says why the model could not be "
+                            "identified (or an older version wrote it: diagnose the recording again)")
     odd = [name for name in e.names if not is_parameter(name)]
     if odd:
         raise DocumentError(f"{path}: estimates: '{one_line(odd[0])}' is no parameter of model or effect; diagnose the "

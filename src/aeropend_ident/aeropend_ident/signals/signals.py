@@ -50,6 +50,34 @@ DIED_AWAY = 5.0
 
 
 @dataclass(frozen=True)
+class Mounting:
+    """How the angle's sensor sits on the arm.
+
+    Attributes:
+        zero: [rad] reading where the arm hangs.
+        flipped: whether the reading falls where the arm is lifted.
+    """
+
+    zero: float = 0.0
+    flipped: bool = False
+
+    def of(self, s: Signals) -> Signals:
+        """A recording whose angle is 0 where the arm hangs, and positive where it is lifted."""
+        theta = s.theta - self.zero
+        return replace(s, theta=-theta if self.flipped else theta, mounting=self)
+
+    def reading(self, theta: float) -> float:
+        """[rad] The reading at an angle, the inverse of `of`."""
+        return self.zero - theta if self.flipped else self.zero + theta
+
+    def notes(self) -> tuple[str, ...]:
+        """What a person should know."""
+        hangs = f"angle: its motion shows that the arm hangs at a reading of {math.degrees(self.zero):.1f} degrees"
+        return tuple([f"{hangs}: taken as zero"] * (self.zero != 0.0)
+                     + ["angle: the reading falls where the arm is lifted: its sign is turned"] * self.flipped)
+
+
+@dataclass(frozen=True)
 class Signals:
     """One recording on the grid of its samples.
 
@@ -65,6 +93,7 @@ class Signals:
         false_speed: (N,) true where omega is wrong: a false capture, or an outlier.
         train: number of samples that models are fitted to; the rest is held out.
         notes: remarks on the data for a person.
+        mounting: of the angle's sensor, if it was found from the motion; `theta` is right then.
         window: first sample at which effects act that the model lacks, and the first at which they act no more; None:
             they act all the time.
     """
@@ -81,6 +110,7 @@ class Signals:
     train: int
     notes: tuple[str, ...] = ()
     window: tuple[int, int] | None = None
+    mounting: Mounting | None = None
 
     def __len__(self) -> int:
         return len(self.duty)

@@ -374,8 +374,9 @@ def _zero(table: Table, text: str, unit: Unit, read: Floats, dated: Dated) -> fl
                              f"{'first' if text == 'start' else 'last'} {REST:g} s")
         moved = float(np.ptp(np.percentile(part, (2, 98))))
         if moved > STILL:
+            which = "first" if text == "start" else "last"
             raise TableError(f"{table.path}: --zero {text}: the arm moves by {math.degrees(moved):.1f} deg in the "
-                             f"{'first' if text == 'start' else 'last'} {REST:g} s: give what is read when it hangs")
+                             f"{which} {REST:g} s, in which it should rest: give what is read when it hangs")
         return float(np.median(part))
     match = _ZERO.match(text.strip())
     if match is None:

@@ -25,6 +25,9 @@ NAMED = {"ms": "ms", "millis": "ms", "us": "us", "micros": "us", "s": "s", "sec"
 SMALLEST_DEGREES, LARGEST_DEGREES = 7.0, 720.0
 """Ranges of an angle in degrees: less is rad, more is counts (choices: a circle has 6.3 rad)."""
 
+LARGEST_READING = 400.0
+"""Largest reading in degrees (choice: a turn, and a zero that is a little off)."""
+
 FEWEST_COUNTS = 30.0
 """Greatest range of whole numbers that are degrees rather than counts (choice: 10 degrees with 1024 counts a turn)."""
 
@@ -92,8 +95,9 @@ def of_angle(values: Floats, *, counts: bool, named: bool) -> Scale:
             return "deg", text, True
         if span <= 400.0 and named:
             return "deg", f"whole numbers, {text}: deg, or counts of a turn?", False
-        return "", f"whole numbers, {text}: counts of a turn? counts:1024", False
-    if span > LARGEST_DEGREES:
+        return "", (f"whole numbers, {text}: counts of a turn, as counts:1024, or degrees a count, as 0.264deg for a "
+                    "potentiometer of 270 degrees on 10 bit?"), False
+    if span > LARGEST_DEGREES or max(high, -low) > LARGEST_READING:
         return "", f"{text}: counts of what?", False
     if span > SMALLEST_DEGREES:
         return "deg", text, True

@@ -206,14 +206,33 @@ def _direction(theta: Array, s: Signals) -> Array:
 
 @dataclass(frozen=True)
 class Regression:
-    """What a regression of the weak form leaves (sum of squares), and its coefficients; the zero in rad."""
+    """What a regression of the weak form leaves (sum of squares), and its coefficients.
+
+    Attributes:
+        left: sum of squares.
+        gravity: G cos θ0.
+        damping: c.
+        gain: g.
+        bias: G sin θ0.
+        friction: f.
+    """
 
     left: float
     gravity: float
     damping: float
     gain: float
-    zero: float
+    bias: float
     friction: float
+
+    @property
+    def zero(self) -> float:
+        """[rad] θ0, if it is small."""
+        return self.bias / self.gravity if self.gravity > 0.0 else 0.0
+
+    @property
+    def hangs_at(self) -> float:
+        """[rad] θ0, anywhere on the circle."""
+        return math.atan2(self.bias, self.gravity)
 
 
 def regress(tests: Sequence[WeakForm], lifts: Sequence[Array], *, friction: bool = False) -> Regression:
@@ -241,4 +260,4 @@ def regress(tests: Sequence[WeakForm], lifts: Sequence[Array], *, friction: bool
     x = x / scale
     gravity, damping, gain, bias = float(x[0]), float(x[1]), float(np.mean(x[shared:-many])), float(np.mean(x[-many:]))
     return Regression(float(np.sum((b - a @ x) ** 2)), gravity, damping, gain,
-                      bias / gravity if gravity > 0.0 else 0.0, float(x[2]) if friction else 0.0)
+                      bias, float(x[2]) if friction else 0.0)

@@ -88,10 +88,10 @@ def lines(since: Since) -> list[str]:
 
 
 def described(c: Change) -> str:
-    """A change in words: `coulomb_friction.accel 0.41 -> 0.83 rad/s² (+0.42, 0.39 to 0.45)`."""
+    """A change in words: `coulomb_friction.accel 0.41 -> 0.83 rad/s²: +102 % (+95 to +109 %)`."""
     unit = "" if c.unit == "-" else f" {c.unit}"
-    between = f"{c.change.value:+.3g}, {c.change.low:+.3g} to {c.change.high:+.3g}"
     if c.before is None:
         return f"{c.name} appeared: {c.after.value:.4g} ({c.after.low:.4g} to {c.after.high:.4g}){unit}"
-    share = f"{100.0 * c.change.value / c.before.value:+.1f} %; " if c.before.value else ""
-    return f"{c.name} {c.before.value:.4g} -> {c.after.value:.4g}{unit} ({share}{between})"
+    size, of, digits = (abs(c.before.value) / 100.0, " %", ".1f") if c.before.value else (1.0, unit, ".3g")
+    value, low, high = (format(x / size, f"+{digits}") for x in (c.change.value, c.change.low, c.change.high))
+    return f"{c.name} {c.before.value:.4g} -> {c.after.value:.4g}{unit}: {value}{of} ({low} to {high}{of})"

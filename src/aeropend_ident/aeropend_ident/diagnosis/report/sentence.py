@@ -16,6 +16,9 @@ from aeropend_sim.model.parameters import PARAMETERS
 CLOSED = 0.9
 """Share of the gap that an effect of the right form closes at least (choice)."""
 
+MOST = 0.5
+"""Share of the squared gap above which it mostly does not repeat (derived: half)."""
+
 NONE = 0.005
 """Share of the gap below which none of it is closed (derived: it is 0 % in whole percent)."""
 
@@ -74,6 +77,11 @@ def verdict(document: DiagnosisDocument) -> list[Part]:
         beside = [Part(", beside "), *listed([*effects, *parameters])] if effects or parameters else []
         return [Part("The model lacks an effect that the catalogue does not contain, at this place: "
                      f"{document.where.place}"), *beside, Part(quiet)]
+    budget = document.closure.budget
+    if not effects and not parameters and reached not in ("nothing open", "most") and budget and (
+            budget.not_repeatable > MOST):
+        return [Part(f"No effect was found, but {open_} of the gap stays open; {percent(budget.not_repeatable)} of the "
+                     "squared gap is no function of duty and state.")]
     if not effects and not parameters:
         return [Part("The model lacks nothing that this recording shows." if reached in ("nothing open", "most") else
                      f"No effect was surely found, but {open_} of the gap stays open.")]
