@@ -62,6 +62,24 @@ def test_nothing_has_changed(monday):
         assert max(abs(found.since.unchanged[name].low), abs(found.since.unchanged[name].high)) < 0.02
 
 
+@pytest.mark.promise("Verdict", "An effect that was perhaps there before, and not seen, is no change")
+@pytest.mark.parametrize(("damping", "hidden"), [(0.12, True), (-0.12, False), (0.0, False)])
+def test_an_effect_whose_place_a_parameter_had_taken_is_no_change(damping, hidden):
+    """Viscous damping had taken the place of drag, or rose beside it, or stayed."""
+    plain = drawn_rig(3, {})
+    before = replace(plain, model={**plain.model, "c_over_J": plain.model["c_over_J"] + damping})
+    monday = diagnose(BENCH, [recorded(before, 3)], 2)
+    e = monday.conclusions.estimates
+    known = Known(e.names, np.array(e.values), np.array(e.covariance), ("monday",))
+    after = plain.with_effects({"quadratic_drag": {"k": 0.3}})
+    found = diagnose(monday.augmented, [recorded(after, 503)], 2, known=known).conclusions.since
+    both = ["quadratic_drag.k", "c_over_J"]
+    assert list(found.perhaps_before) == (both if hidden else [])
+    assert found.claimed == ([] if hidden else both if damping else both[:1])
+    said = "seen now, but perhaps there before" if hidden else "changed: quadratic_drag.k appeared"
+    assert changes.lines(found)[0].startswith(f"  {said}")
+
+
 @pytest.mark.promise("Verdict", "An effect that grew is named, with its size before and after")
 def test_friction_that_grew_is_named(monday):
     found = tuesday(monday, RIG.with_effects({"coulomb_friction": {"accel": 2.0 * FRICTION}})).conclusions

@@ -439,12 +439,15 @@ class Since:
         changes: what has changed.
         unchanged: name -> change, over the value before, of a parameter that the recording shows to be as before.
         not_shown: parameters of which this recording does not show whether they have changed.
+        perhaps_before: changes that nothing but an effect explains that was there before, and not seen: the effect, and
+            the parameters that then took its place. None of them is claimed.
     """
 
     verdicts: tuple[str, ...]
     changes: tuple[Change, ...]
     unchanged: Mapping[str, Interval]
     not_shown: tuple[str, ...]
+    perhaps_before: tuple[str, ...] = ()
 
     @property
     def named(self) -> str:

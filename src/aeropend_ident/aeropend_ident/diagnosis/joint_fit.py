@@ -115,10 +115,10 @@ class JointFit:
             begun = {p.name: p.begin for p in started(parameters, start)}
             return sum(float(np.sum(r * r)) for r in residuals(begun).values())
 
-        best = min((self.values, self._expected_without(effects)), key=gap)
+        best = min((self.values, self.expected_without(effects)), key=gap)
         return fit(residuals, started(parameters, best), 1, AGAIN_STEPS, math.inf).values
 
-    def _expected_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
+    def expected_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         """The values without some of the effects if the readings were linear in all of them."""
         every = self.parameters
         names = list(self.fit.values)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Container, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,10 @@ Array = NDArray[np.float64]
 
 FREE_SD = 0.5
 """Relative standard deviation of a parameter that an earlier verdict says nothing of (choice: nearly free)."""
+
+ALIKE = 3.0
+"""Greatest ratio, either way, of a change to that which an effect that was not seen explains (choice: another motion
+shows the effect more, or less, but in the same direction)."""
 
 SHOWN = 0.25
 """Standard deviation of a change, over the value, above which a recording does not show whether it changed (choice)."""
@@ -141,7 +145,25 @@ def changes(known: Known, joint: JointFit, statistical: Statistical, claimed: Co
                 open_.append(name)
             else:
                 same[name] = interval(off / before, sd / before)
-    return Since(known.verdicts, tuple(changed), same, tuple(open_))
+    hidden = _perhaps_before(joint, changed)
+    changed = [replace(c, claimed=False) if c.name in hidden else c for c in changed]
+    return Since(known.verdicts, tuple(changed), same, tuple(open_), tuple(hidden))
+
+
+def _perhaps_before(joint: JointFit, changed: Sequence[Change]) -> list[str]:
+    """Changes that an effect explains which was there before, and not seen.
+
+    Such an effect has appeared, and parameters have changed as they do in a fit without it: they took its place.
+    """
+    appeared = [h for f in joint.findings.values() for h in f.effects if h.own[0].name in {
+        c.name for c in changed if c.before is None and c.claimed}]
+    if not appeared:
+        return []
+    without = joint.expected_without(appeared)
+    moved = [c for c in changed if c.before is not None and c.claimed]
+    stand_ins = [c.name for c in moved if c.before is not None and
+                 1.0 / ALIKE <= (without[c.name] - c.after.value) / (c.before.value - c.after.value) <= ALIKE]
+    return [*(p.name for h in appeared for p in h.own), *stand_ins] if stand_ins else []
 
 
 def _from_form(joint: JointFit, name: str) -> float:

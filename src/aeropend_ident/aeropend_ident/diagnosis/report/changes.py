@@ -10,18 +10,19 @@ from aeropend_ident.diagnosis.document import Change, DiagnosisDocument, Interva
 from aeropend_ident.diagnosis.report.number_format import interval, percent, quantity
 
 APPEARED = "was not there"
+UNSEEN = "perhaps as before: an effect that was not seen then, and a parameter in its place"
 
 
 @dataclass(frozen=True)
 class ChangeRow:
-    """A change as texts: name, value before and after, change, and its 95 % interval."""
+    """A change as texts: name, value before and after, change, its 95 % interval, and why it is not claimed, if so."""
 
     name: str
     before: str
     after: str
     change: str
     between: str
-    claimed: bool
+    remark: str
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ def section(document: DiagnosisDocument) -> ChangesSection | None:
     since = document.since
     if since is None:
         return None
-    rows = [_row(c) for c in since.by_weight]
+    rows = [_row(c, c.name in since.perhaps_before) for c in since.by_weight]
     unchanged = [(name, percent(farthest(x))) for name, x in since.unchanged.items()]
     return ChangesSection(since.named, len(since.verdicts) > 1, rows, unchanged, since.not_shown)
 
@@ -58,15 +59,16 @@ def farthest(change: Interval) -> float:
     return max(abs(change.low), abs(change.high))
 
 
-def _row(c: Change) -> ChangeRow:
+def _row(c: Change, perhaps_before: bool) -> ChangeRow:
+    remark = "" if c.claimed else UNSEEN if perhaps_before else "too small or too unsure to be claimed"
     before = APPEARED if c.before is None else quantity(c.before.value, c.unit, 4)
     after = quantity(c.after.value, c.unit, 4)
     if c.before is None or not c.before.value:
         _, between = interval(c.change.value, c.change.low, c.change.high)
-        return ChangeRow(c.name, before, after, quantity(c.change.value, c.unit), between, c.claimed)
+        return ChangeRow(c.name, before, after, quantity(c.change.value, c.unit), between, remark)
     low, high = sorted((c.change.low / c.before.value, c.change.high / c.before.value))
     return ChangeRow(c.name, before, after, percent(c.change.value / c.before.value, sign=True),
-                     f"{percent(low, sign=True)} to {percent(high, sign=True)}", c.claimed)
+                     f"{percent(low, sign=True)} to {percent(high, sign=True)}", remark)
 
 
 def verdict_line(since: Since, place: str) -> str:
@@ -78,7 +80,10 @@ def verdict_line(since: Since, place: str) -> str:
 
 def lines(since: Since) -> list[str]:
     """What has changed, in lines for the terminal."""
-    out = [f"  {'changed' if c.claimed else 'small change'}: {described(c)}" for c in since.by_weight]
+    out = [f"  {'changed' if c.claimed else 'small change'}: {described(c)}" for c in since.by_weight
+           if c.name not in since.perhaps_before]
+    if hidden := [described(c) for c in since.changes if c.name in since.perhaps_before]:
+        out.append(f"  seen now, but perhaps there before, with a parameter in its place: {'; '.join(hidden)}")
     same = [f"{name} (at most {100.0 * farthest(x):.2g} %)" for name, x in since.unchanged.items()]
     if same:
         out.append(f"  not changed: {', '.join(same)}")
