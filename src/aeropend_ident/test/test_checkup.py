@@ -50,7 +50,7 @@ def test_a_good_recording_is_ok(path):
 
 
 @pytest.mark.parametrize(("change", "level", "words"), [
-    (lambda r: {"theta": r.theta * 180.0 / np.pi}, "warning", "may be in degrees"),
+    (lambda r: {"theta": r.theta * 180.0 / np.pi}, "warning", "imported with a wrong unit"),
     (lambda r: {"theta": -r.theta}, "warning", "its sign may be wrong"),
     (lambda r: {"theta": np.roll(r.theta, len(r) // 2)}, "warning", "hardly follows the duty"),
     (lambda r: {"theta": r.theta + 0.4}, "warning", "at rest without duty the angle is 0.4 rad"),

@@ -156,3 +156,12 @@ def test_a_lag_that_differs_between_rise_and_fall_is_found():
     assert body["which"]["verdict"] == "none"
     assert body["identified"]["own"]["thrust_lag.fall"]["value"] == pytest.approx(4.0, rel=0.3)
     assert body["channels"]["theta"]["fit_unseen"] > 0.95
+
+
+def test_an_arm_that_rests_at_first_gives_its_zero_to_a_reading():
+    s = driven()
+    rest = round(0.5 / s.period)
+    theta = np.concatenate([np.zeros(rest), s.theta]) + 1.2
+    resting = recorded(theta, np.concatenate([np.zeros(rest), s.duty]))
+    (found,) = mounted(BENCH, [resting])
+    assert found.mounting.zero == 1.2

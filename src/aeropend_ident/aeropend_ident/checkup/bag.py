@@ -117,8 +117,8 @@ def _angle(path: str, read: Recording) -> Iterator[Check]:
         return
     span = float(np.ptp(known))
     if span > TURNS:
-        yield warning(path, f"the angle spans {span:.3g} rad, more than two turns: it may be in degrees; import it "
-                      "again with its unit")
+        yield warning(path, f"the angle spans {span:.3g} rad, more than two turns: the arm went round, or the angle "
+                      "was imported with a wrong unit")
     elif span < SMALL:
         yield warning(path, f"the angle spans only {span:.2g} rad: the arm hardly moves, or it has another unit")
     rest = resting_angle(read)

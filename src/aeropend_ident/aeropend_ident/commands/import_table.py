@@ -328,9 +328,15 @@ def _kept(arguments: Sequence[str], given: argparse.Namespace) -> list[str]:
     for k, word in enumerate(arguments):
         if word in paths and (not k or arguments[k - 1] != "--with"):
             paths.remove(word)
-        elif word != "--accept":
+        elif word != "--accept" and not _names_a_column([*arguments[k - 1:k], word]):
             kept.append(word)
     return kept
+
+
+def _names_a_column(words: Sequence[str]) -> bool:
+    """Whether the last word is an option for a column, or its value."""
+    options_ = [f"--{quantity}" for quantity in UNITS]
+    return words[-1].partition("=")[0] in options_ or words[0] in options_
 
 
 @entry_point("import")

@@ -134,7 +134,7 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
         lines.append(f"verdict: unknown ({document.where.place}). No effect of the catalogue explains the misfit"
                      f"{f': {why}' if why else ''}.")
     else:
-        left = {"part": f"; {plain_percent(1.0 - (closure.closed or 0.0))} % of the gap stays open",
+        left = {"part": f"; {_spaced(sentence.open_part(closure))} stays open",
                 "none": "; none of the gap closes on held-out data"}.get(sentence.closing(closure), "")
         lines.append(f"verdict: {' and '.join(which.effects)} ({document.where.place}){left}")
     if which.verdict != CANNOT_TELL and (failed := sentence.failed(document)):

@@ -509,7 +509,7 @@ def _angle_scale(one: _Seen) -> scales.Scale:
     if said:
         span = UNITS["theta"][said] * float(np.ptp(one.column.values[np.isfinite(one.column.values)]))
         possible = 0.01 < span < 4.0 * math.pi
-        return "", f"in {said}" if possible else f"in {said}, {why}?", possible
+        return "", f"in {said}" if possible else f"in {said}, {why.partition(':')[0]}: did the arm go round?", possible
     return unit, why, sure
 
 

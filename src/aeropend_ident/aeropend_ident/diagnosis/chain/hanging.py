@@ -22,6 +22,7 @@ from aeropend_ident.diagnosis.chain.weak_start import (
     regress,
     unit_lift,
 )
+from aeropend_ident.signals.signals import STILL as NO_DUTY
 from aeropend_ident.signals.signals import Mounting, Signals
 from aeropend_sim.model.parameters import Model
 
@@ -29,6 +30,10 @@ OFF = 0.25
 """[rad] Zero of the angle above which the readings are shifted; the fits find a smaller one.
 
 Measured: of 40 drawn rigs with zeros all over the circle the largest error of a zero was 0.14 rad."""
+
+REST, FEWEST, STILL = 0.2, 5, 5.0
+"""Least time [s] and number of readings of an arm at rest, and their greatest distance from the first ones, in standard
+deviations of a reading (choices)."""
 
 TURN = 2.0 * math.pi
 
@@ -54,7 +59,22 @@ def mounted(model: Model, recordings: Sequence[Signals]) -> list[Signals]:
             zero += -r.hangs_at if found.flipped else r.hangs_at
             zero += TURN * round((middle - zero) / TURN)  # of all turns that of the readings
         found = Mounting(zero, found.flipped != (r.gain < 0.0))
+    if found.zero != 0.0 and (rest := _at_rest(every[0])) is not None and abs(rest - found.zero) < OFF:
+        found = replace(found, zero=rest)
     return [found.of(s).noted(*found.notes()) for s in every]
+
+
+def _at_rest(s: Signals) -> float | None:
+    """[rad] The reading of an arm that rests at first and is not held: the duty is 0, or changes without moving it."""
+    known = np.flatnonzero(np.isfinite(s.theta))
+    x = s.theta[known]
+    first = max(FEWEST, round(REST / s.period))
+    moved = np.abs(x - np.median(x[:first])) > STILL * s.sigma["theta"]
+    stop = int(np.argmax(moved)) if moved.any() else len(x)
+    held = s.duty[:int(known[min(stop, len(known) - 1)])]
+    if stop < first or (held.max() >= NO_DUTY and np.ptp(held) < NO_DUTY):
+        return None
+    return float(np.median(x[:stop]))
 
 
 def _likeliest(model: Model, recordings: Sequence[Signals]) -> Regression:

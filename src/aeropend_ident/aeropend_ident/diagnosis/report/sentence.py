@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from aeropend_ident.diagnosis.document import CANNOT_TELL, ClosedGap, DiagnosisDocument, Since
+from aeropend_ident.diagnosis.document import CANNOT_TELL, ClosedGap, Closure, DiagnosisDocument, Since
 from aeropend_ident.diagnosis.policy import GOOD_ENOUGH
 from aeropend_ident.diagnosis.report.number_format import percent, quantity
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH, RANDOM
@@ -49,6 +49,15 @@ def closing(gap: ClosedGap) -> Closing:
     return "part" if gap.closed >= NONE else "none"
 
 
+def open_part(gap: Closure) -> str:
+    """How much of a gap stays open, in words: of the squared one, as shares of effects are, if that is known."""
+    if closing(gap) != "part":
+        return "all of the gap"
+    if gap.budget is not None:
+        return f"{percent(1.0 - gap.budget.found)} of the squared gap"
+    return f"{percent(1.0 - (gap.closed or 0.0))} of the gap"
+
+
 def failed(document: DiagnosisDocument) -> str:
     """Why the models of a diagnosis are of no use, as a sentence; "" if they are."""
     if document.which.verdict == CANNOT_TELL:
@@ -66,7 +75,7 @@ def verdict(document: DiagnosisDocument) -> list[Part]:
     which, reached = document.which, closing(document.closure)
     effects = [e for e in which.effects if e != PARAMETER_MISMATCH]
     parameters = _parameters(document)
-    open_ = percent(1.0 - (document.closure.closed or 0.0)) if reached == "part" else "all"
+    open_ = open_part(document.closure)
     if which.verdict == CANNOT_TELL:
         reason = _reason(which.unexplained)[0]
         return [Part(f"Cannot tell: {reason}." if reason else "Cannot tell which effect the model lacks.")]
@@ -80,16 +89,16 @@ def verdict(document: DiagnosisDocument) -> list[Part]:
     budget = document.closure.budget
     if not effects and not parameters and reached not in ("nothing open", "most") and budget and (
             budget.not_repeatable > MOST):
-        return [Part(f"No effect was found, but {open_} of the gap stays open; {percent(budget.not_repeatable)} of the "
-                     "squared gap is no function of duty and state.")]
+        return [Part(f"No effect was found, but {open_} stays open; {percent(budget.not_repeatable)} is no function of "
+                     "duty and state.")]
     if not effects and not parameters:
         return [Part("The model lacks nothing that this recording shows." if reached in ("nothing open", "most") else
-                     f"No effect was surely found, but {open_} of the gap stays open.")]
+                     f"No effect was surely found, but {open_} stays open.")]
     if reached == "none" and not set(effects) <= RANDOM:
         several = len(effects) + len(parameters) > 1
         return [*listed([*effects, *parameters]), Part(f" {'fit' if several else 'fits'} the fitted part of the "
                 f"recording, but {'close' if several else 'closes'} none of the gap on held-out data.")]
-    left = f"; {open_} of the gap stays open." if reached in ("part", "none") else quiet
+    left = f"; {open_} stays open." if reached in ("part", "none") else quiet
     return [*_claim(effects, parameters, complete=left == "."), Part(left)]
 
 
