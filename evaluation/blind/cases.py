@@ -284,7 +284,7 @@ def draw(name: str, kind: str, effects: list[str], form: str, nominal: Mapping[s
         The case, and the channels and the duty (N,) of its recording.
     """
     rng = np.random.default_rng(seed)
-    numbers = {k: v * (1.0 + rng.uniform(-OFF, OFF)) for k, v in nominal.items()}
+    numbers = {k: nominal[k] * (1.0 + rng.uniform(-OFF, OFF)) for k in plant.NUMBERS}
     duty = duty_signal(rng, duration)
     sizer = Sizer(numbers, sensing, duty) if effects else None
     drawn, sizes = [], []

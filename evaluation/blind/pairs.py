@@ -127,7 +127,7 @@ def draw(rng: np.random.Generator, duration: float, change: Callable[[Rig, np.ra
         change: what happens between them.
     """
     nominal = load(folder.MODEL)
-    rig = Rig({k: v * (1.0 + rng.uniform(-cases.OFF, cases.OFF)) for k, v in nominal.model.items()})
+    rig = Rig({k: nominal.model[k] * (1.0 + rng.uniform(-cases.OFF, cases.OFF)) for k in plant.NUMBERS})
     if rng.random() < 0.5:
         own = str(rng.choice(OWN))
         head, start, neutral = cases.scale(own)

@@ -93,7 +93,7 @@ def test_the_verdict_in_a_terminal_tells_the_shares_in_plain_characters():
     lines = verdict_lines(document(diagnose(BENCH, [signals], 2), ["bag"], "bench", 0.0))
     (claimed,) = (line for line in lines if line.startswith("  brush_drop: "))
     (small,) = (line for line in lines if line.startswith("  not claimed: coulomb_friction, "))
-    assert all(re.search(r"\d+ % \(-?\d+ to \d+ %\) of the gap$", line) for line in (claimed, small))
+    assert all(re.search(r"\d+ % \(-?\d+ to \d+ %\) of the squared gap$", line) for line in (claimed, small))
     assert lines == [printable(line) for line in lines]
 
 

@@ -31,11 +31,12 @@ OFF = 0.25
 
 Measured: of 40 drawn rigs with zeros all over the circle the largest error of a zero was 0.14 rad."""
 
-REST, FEWEST, STILL = 0.2, 5, 5.0
-"""Least time [s] and number of readings of an arm at rest, and their greatest distance from the first ones, in standard
-deviations of a reading (choices)."""
+REST, FEWEST = 0.2, 5
+"""Least time [s] and number of readings of an arm at rest (choice)."""
 
-TURN = 2.0 * math.pi
+STILL = 5.0
+"""Greatest distance of a reading at rest from the first ones, in standard deviations of a reading (choice)."""
+
 
 TIMES = 2
 """Times that the zero is looked for: an arm that is found to hang at first has a rotor that stands (choice)."""
@@ -57,7 +58,7 @@ def mounted(model: Model, recordings: Sequence[Signals]) -> list[Signals]:
         zero = found.zero
         if abs(r.hangs_at) > OFF or zero != 0.0:
             zero += -r.hangs_at if found.flipped else r.hangs_at
-            zero += TURN * round((middle - zero) / TURN)  # of all turns that of the readings
+            zero += math.tau * round((middle - zero) / math.tau)  # of all turns that of the readings
         found = Mounting(zero, found.flipped != (r.gain < 0.0))
     if found.zero != 0.0 and (rest := _at_rest(every[0])) is not None and abs(rest - found.zero) < OFF:
         found = replace(found, zero=rest)

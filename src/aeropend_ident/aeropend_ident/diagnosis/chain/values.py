@@ -22,7 +22,7 @@ STAGES: dict[str, tuple[str, ...]] = {
 """The stages of the cut chain and the parameters of the model in each."""
 
 FEWEST_PARAMETERS = sum(map(len, STAGES.values())) - 2
-"""Number of parameters of a model without `v_full` and `reverse`."""
+"""Number of parameters of a model without `v_full` and `reverse` (derived)."""
 
 FILTER = "sensing.angle_filter_tau"
 """The one parameter of the measurement chain that is fitted along."""
