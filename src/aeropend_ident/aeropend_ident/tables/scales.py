@@ -126,8 +126,8 @@ def of_command(values: Floats, words: list[str], *, counts: bool) -> Scale:
         sure = top in FULL or (full == 255 and top != 180.0)
         return f"counts:{full}", f"whole numbers up to {top:g}" + ": or of others?" * (not sure), sure
     if top > 100.0 or (top < LEAST_PERCENT and not counts):
-        return f"counts:{top:g}", (f"{text}: in which unit? counts:{top:g} makes the largest full duty, which is enough if "
-                                   "the rig is not calibrated"), False
+        return f"counts:{top:g}", (f"{text}: in which unit? counts:{top:g} makes the largest full duty, enough for a "
+                                   "rig that is not calibrated"), False
     pwm = "pwm" in words  # what a microcontroller writes into its register
     if counts and not ((top == 100.0 and not pwm) or set(words) & PERCENT):
         return "counts:255" if pwm else "%", f"whole numbers up to {top:g}: %, or counts of 255?", False

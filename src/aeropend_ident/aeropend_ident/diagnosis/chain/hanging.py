@@ -38,6 +38,10 @@ STILL = 5.0
 """Greatest distance of a reading at rest from the first ones, in standard deviations of a reading (choice)."""
 
 
+CLEARLY = 2.0
+"""Least ratio of what a regression leaves with the zero as read to what one with a free zero leaves, to move the zero
+(choice: a free zero must halve it; the second rotor of a helicopter makes it 1.5, an offset of 80 degrees 8)."""
+
 TIMES = 2
 """Times that the zero is looked for: an arm that is found to hang at first has a rotor that stands (choice)."""
 
@@ -52,16 +56,17 @@ def mounted(model: Model, recordings: Sequence[Signals]) -> list[Signals]:
     every, found = list(recordings), Mounting()
     if any(s.mounting is not None for s in every) or not all(s.driven for s in every):
         return every
+    rest = _at_rest(every[0])
+    found = Mounting(rest if rest is not None and abs(rest) > OFF else 0.0)
     middle = float(np.nanmedian(np.concatenate([s.theta for s in every])))
     for _ in range(TIMES):
-        r = _likeliest(model, [found.of(s) for s in every])
+        moved = [found.of(s) for s in every]
+        r = _likeliest(model, moved)
         zero = found.zero
-        if abs(r.hangs_at) > OFF or zero != 0.0:
+        if abs(r.hangs_at) > OFF and _likeliest(model, moved, zero=False).left > CLEARLY * r.left:
             zero += -r.hangs_at if found.flipped else r.hangs_at
             zero += math.tau * round((middle - zero) / math.tau)  # of all turns that of the readings
         found = Mounting(zero, found.flipped != (r.gain < 0.0))
-    if found.zero != 0.0 and (rest := _at_rest(every[0])) is not None and abs(rest - found.zero) < OFF:
-        found = replace(found, zero=rest)
     return [found.of(s).noted(*found.notes()) for s in every]
 
 
@@ -78,12 +83,12 @@ def _at_rest(s: Signals) -> float | None:
     return float(np.median(x[:stop]))
 
 
-def _likeliest(model: Model, recordings: Sequence[Signals]) -> Regression:
-    """The regression of the weak form that leaves least, over static curves and lags."""
+def _likeliest(model: Model, recordings: Sequence[Signals], *, zero: bool = True) -> Regression:
+    """The regression of the weak form that leaves least, over static curves and lags; `zero`: whether it is unknown."""
     tried = [downsampled(s) for s in recordings]
     tests = [WeakForm(s) for s in tried]
     found = []
     for dead, bend, load, lag in product(DEAD_ZONES, BENDS, LOADS[:1], LAGS):
         m = replace(model, model=curve(model.model, dead, bend, load, lag))
-        found.append(regress(tests, [unit_lift(m, s) for s in tried]))
+        found.append(regress(tests, [unit_lift(m, s) for s in tried], zero=zero))
     return min(found, key=lambda r: r.left)

@@ -235,13 +235,15 @@ class Regression:
         return math.atan2(self.bias, self.gravity)
 
 
-def regress(tests: Sequence[WeakForm], lifts: Sequence[Array], *, friction: bool = False) -> Regression:
+def regress(tests: Sequence[WeakForm], lifts: Sequence[Array], *, friction: bool = False, zero: bool = True
+            ) -> Regression:
     """Regress the weak form of several recordings; each has a gain and a zero of its own, of which the means count.
 
     Args:
         tests: of the recordings.
         lifts: (N,) each, the input.
         friction: with dry friction, from the stretches in which the arm moves.
+        zero: whether the zero of the angle is unknown.
     """
     many, every = len(tests), range(len(tests))
     shared = 2 + friction
@@ -249,7 +251,7 @@ def regress(tests: Sequence[WeakForm], lifts: Sequence[Array], *, friction: bool
     for j, (w, u) in enumerate(zip(tests, lifts)):
         kept = w.moves if friction else np.ones(len(w.left), dtype=bool)
         nothing = np.zeros(len(w.left))
-        own = [x if k == j else nothing for x in (w.of(u), w.columns[2]) for k in every]
+        own = [x if k == j else nothing for x in (w.of(u), w.columns[2] if zero else nothing) for k in every]
         parts.append(np.column_stack([*w.columns[:2], *w.columns[3:3 + friction], *own])[kept])
         left.append(w.left[kept])
     a, b = np.concatenate(parts), np.concatenate(left)
