@@ -98,6 +98,7 @@ def test_a_mass_on_the_arm_is_named(monday):
     assert {c.name for c in found.changes if c.claimed} == set(WITH_A_MASS)
     for c in found.changes:
         assert c.change.value / c.before.value == pytest.approx(WITH_A_MASS[c.name] - 1.0, abs=0.01)
+    assert any("a mass put on the arm" in line for line in changes.lines(found))
 
 
 def test_a_product_is_known_although_its_factors_are_not(monday):

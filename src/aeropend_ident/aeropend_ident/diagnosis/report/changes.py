@@ -10,6 +10,10 @@ from aeropend_ident.diagnosis.document import Change, DiagnosisDocument, Interva
 from aeropend_ident.diagnosis.report.number_format import interval, percent, quantity
 
 APPEARED = "was not there"
+CAUSES = {("mgd_over_J", "L_over_J", "c_over_J"): "a mass put on the arm, or taken off, changes these together",
+          ("k_load", "J_m"): "another propeller changes these together"}
+"""What a person may have done, by parameters that have changed; see `hypotheses.TOGETHER`."""
+
 UNSEEN = "perhaps as before: an effect that was not seen then, and a parameter in its place"
 
 
@@ -35,6 +39,7 @@ class ChangesSection:
         rows: what has changed, what makes a material share of the gap first.
         unchanged: (name, largest change that the recording allows).
         not_shown: parameters of which the recording does not show it.
+        cause: what a person may have done; "" if that is open.
     """
 
     verdicts: str
@@ -42,6 +47,7 @@ class ChangesSection:
     rows: Sequence[ChangeRow]
     unchanged: Sequence[tuple[str, str]]
     not_shown: Sequence[str]
+    cause: str
 
 
 def section(document: DiagnosisDocument) -> ChangesSection | None:
@@ -51,7 +57,7 @@ def section(document: DiagnosisDocument) -> ChangesSection | None:
         return None
     rows = [_row(c, c.name in since.perhaps_before) for c in since.by_weight]
     unchanged = [(name, percent(farthest(x))) for name, x in since.unchanged.items()]
-    return ChangesSection(since.named, len(since.verdicts) > 1, rows, unchanged, since.not_shown)
+    return ChangesSection(since.named, len(since.verdicts) > 1, rows, unchanged, since.not_shown, cause(since))
 
 
 def farthest(change: Interval) -> float:
@@ -82,6 +88,8 @@ def lines(since: Since) -> list[str]:
     """What has changed, in lines for the terminal."""
     out = [f"  {'changed' if c.claimed else 'small change'}: {described(c)}" for c in since.by_weight
            if c.name not in since.perhaps_before]
+    if cause(since):
+        out.append(f"  {cause(since)}")
     if hidden := [described(c) for c in since.changes if c.name in since.perhaps_before]:
         out.append(f"  seen now, but perhaps there before, with a parameter in its place: {'; '.join(hidden)}")
     same = [f"{name} (at most {100.0 * farthest(x):.2g} %)" for name, x in since.unchanged.items()]
@@ -90,6 +98,11 @@ def lines(since: Since) -> list[str]:
     if since.not_shown:
         out.append(f"  the recording does not show whether these have changed: {', '.join(since.not_shown)}")
     return out
+
+
+def cause(since: Since) -> str:
+    """What a person may have done; "" if nothing is known to change these parameters."""
+    return next((text for names, text in CAUSES.items() if set(names) <= set(since.claimed)), "")
 
 
 def described(c: Change) -> str:
