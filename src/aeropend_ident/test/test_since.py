@@ -192,3 +192,22 @@ def test_a_gust_that_was_not_there_has_appeared(monday):
     known = Known(e.names, np.array(e.values), np.array(e.covariance), ("windy",))
     again = diagnose(found.augmented, [recorded(windy, 504)], 2, known=known).conclusions
     assert [c.name for c in again.since.changes if c.claimed] == []
+
+
+@pytest.mark.promise("Verdict", "Zero and sign that were found from the motion serve the next recording too")
+def test_the_next_recording_of_a_rig_that_is_read_upside_down(tmp_path, capsys):
+    for day, seed in (("monday", 3), ("tuesday", 503)):
+        columns = columns_of(RIG, seed)
+        missing = np.full(len(columns["duty"]), np.nan)
+        bags.write(tmp_path / day, {"theta": -1.4 - columns["theta"], "duty": columns["duty"], "omega": missing,
+                                    "i_a": missing, "v_a": missing}, round(SAMPLE_PERIOD * 1e9))
+    out = tmp_path / "verdict"
+    assert command.main([str(tmp_path / "monday"), "--uncalibrated", "--out", str(out)]) == 0
+    assert "hangs at a reading of -80" in capsys.readouterr().out
+    assert command.main([str(tmp_path / "tuesday"), "--since", str(out), "--out", str(tmp_path / "since")]) == 0
+    assert "nothing has changed since verdict" in capsys.readouterr().out
+    model = str(out / "augmented.yaml")
+    assert command.main([str(tmp_path / "tuesday"), "--model", model, "--out", str(tmp_path / "model")]) == 0
+    said = capsys.readouterr()
+    assert "every parameter counts as known to 5 %" in said.err
+    assert "its sign is turned" not in said.err

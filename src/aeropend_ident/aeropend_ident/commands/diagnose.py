@@ -23,7 +23,8 @@ from rich.table import Table
 from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.diagnosis import batch, dask_cluster, since
 from aeropend_ident.diagnosis.diagnosis import diagnose
-from aeropend_ident.diagnosis.document import Across
+from aeropend_ident.diagnosis.document import Across, DocumentError, Identified
+from aeropend_ident.diagnosis.document import read as read_document
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.diagnosis.results import FILES, Results, document
 from aeropend_ident.diagnosis.validation import validate
@@ -117,6 +118,17 @@ def _jobs(text: str) -> int:
     return int(text)
 
 
+def identified_with(model: Path) -> Identified | None:
+    """How a model file was identified, if it is that of a verdict on an uncalibrated rig."""
+    verdict = model.parent / "diagnosis.json"
+    if model.name != "augmented.yaml" or not verdict.is_file():
+        return None
+    try:
+        return read_document(verdict).identified
+    except DocumentError:
+        return None
+
+
 def run(options: argparse.Namespace, command: str) -> None:
     """Diagnose recordings of one rig together and write the results.
 
@@ -129,14 +141,19 @@ def run(options: argparse.Namespace, command: str) -> None:
     known, uncalibrated = None, options.fit_nominal
     if options.since:
         model, known, verdicts = since.read([Path(folder) for folder in options.since])
-        uncalibrated = verdicts[-1].identified is not None
+        of_rig = verdicts[-1].identified
+        uncalibrated = of_rig is not None
     else:
         model = load(options.model)
+        if of_rig := identified_with(Path(options.model)):
+            print(printable(f"diagnose: {options.model} was identified by a diagnosis, and --since "
+                            f"{Path(options.model).parent} knows how surely; with --model every parameter counts as "
+                            "known to 5 %"), file=sys.stderr)
     with progress("reading") as show:
         signals, tests = ([signals_of(bag, options.namespace, model, options.held_out,
                                       fit_nominal=uncalibrated) for bag in bags]
                           for bags in (options.bags, options.test))
-        if known is not None and (of_rig := verdicts[-1].identified) is not None:
+        if of_rig is not None:
             signals = [(of_rig.mounting or Mounting()).of(s) for s in signals]
         found = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal, material=options.material,
                          seconds=options.seconds, known=known, progress=lambda what, share: show(share, what))
