@@ -16,9 +16,11 @@ from typing import Any
 import numpy as np
 
 from aeropend_ident.tables import scales
-from aeropend_ident.tables.names import STRONG, WEAK, Meaning, meaning, words
+from aeropend_ident.tables.computed import FOLLOWS, explain
+from aeropend_ident.tables.names import STRONG, WEAK, Meaning
+from aeropend_ident.tables.seen import Seen, look_at, says
 from aeropend_ident.tables.table import Column, Floats, Table
-from aeropend_ident.tables.traits import Origin, Traits, differences, gain, is_error, origins, tracks, traits
+from aeropend_ident.tables.traits import Traits, gain, tracks
 from aeropend_ident.tables.units import CLOCK, RPM, UNITS, known
 
 SURE = 2.5
@@ -51,9 +53,6 @@ other, of which the angle is the last and the command the first (measured: `make
 AGAINST = -3.5
 """[nats] Log odds of the numbers below which they contradict the name (choice: 33 to 1)."""
 
-FOLLOWS = -4.0
-"""[nats] Log odds of a column that is computed from another one (choice: 50 to 1)."""
-
 MOVED = -3.0
 """[nats] Log odds of no command where a column predicts the angle and does not follow from it (measured with free
 swings: fewer than one column in 100)."""
@@ -84,18 +83,6 @@ class Guess:
     sure: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """All that is known about a column."""
-
-    column: Column
-    meaning: Meaning
-    traits: Traits
-    words: tuple[str, ...]
-    counts: bool
-    """Whether the numbers may be counts: they are whole, and not written with decimals."""
-
-
 @dataclass(frozen=True)
 class Given:
     """What the user says that no file contains.
@@ -117,7 +104,7 @@ def guess(table: Table, given: Given | None = None) -> list[Guess]:
         given: what the user says.
     """
     given = given or Given()
-    seen = _seen(table)
+    seen = look_at(table)
     found = [_nothing(one) for one in seen]
     clock = _clock(table, seen, found)
     _arm(table, seen, found, clock, given)
@@ -127,32 +114,7 @@ def guess(table: Table, given: Given | None = None) -> list[Guess]:
     return found
 
 
-def _seen(table: Table) -> list[_Seen]:
-    out = []
-    for k, column in enumerate(table.columns):
-        x = column.values[np.isfinite(column.values)]
-        decimals = table.lengths is not None and any("." in cell or "," in cell for cell in column.shown)
-        out.append(_Seen(column, _meaning(table, k), traits(column.values), tuple(words(column.name)),
-                         not decimals and bool((x == np.rint(x)).all())))
-    return out
-
-
-def _meaning(table: Table, k: int) -> Meaning:
-    """What the name of a column means; that of a matrix does not tell which of its columns is which."""
-    name, columns = table.columns[k].name, [column.name for column in table.columns]
-    series = name.rstrip("0123456789")
-    if series != name and sum(other.rstrip("0123456789") == series != other for other in columns) > 2:
-        return Meaning()  # x1, x2, x3
-    stem = name.rpartition("[")[0]
-    same = [other for other in columns if stem and other.rpartition("[")[0] == stem and other.endswith("]")]
-    if name.endswith("]") and same[2:]:
-        return Meaning()
-    if name.endswith("]") and same[1:] and name == same[0]:
-        return Meaning()  # the time, where there are two
-    return meaning(name, table.columns[k].unit)
-
-
-def _nothing(one: _Seen) -> Guess:
+def _nothing(one: Seen) -> Guess:
     column, named = one.column, one.meaning
     if column.is_text:
         needed = named.quantity in ("time", "theta", "duty") and named.odds >= STRONG
@@ -166,7 +128,7 @@ def _nothing(one: _Seen) -> Guess:
 
 def time_of(table: Table) -> tuple[int, float | None] | None:
     """The column of the time, and the size of its unit [s], None if that is not clear; None without a time."""
-    seen = _seen(table)
+    seen = look_at(table)
     found = [_nothing(one) for one in seen]
     k = _clock(table, seen, found)
     if k is None:
@@ -176,7 +138,7 @@ def time_of(table: Table) -> tuple[int, float | None] | None:
     return k, UNITS["time"][unit] if unit and found[k].sure else None
 
 
-def _clock(table: Table, seen: list[_Seen], found: list[Guess]) -> int | None:
+def _clock(table: Table, seen: list[Seen], found: list[Guess]) -> int | None:
     """Find the time; returns its column."""
     odds = {k: _clock_odds(one) for k, one in enumerate(seen) if not found[k].why}
     best = max(odds, key=lambda k: (odds[k], len(np.unique(table.columns[k].values)), -k), default=None)
@@ -205,7 +167,7 @@ def _clock(table: Table, seen: list[_Seen], found: list[Guess]) -> int | None:
     return best
 
 
-def _clock_odds(one: _Seen) -> float:
+def _clock_odds(one: Seen) -> float:
     if one.column.is_clock:
         return 2.0 * STRONG
     if one.traits.constant:
@@ -278,15 +240,17 @@ def about_command(others: list[tuple[float, float]]) -> str:
     return "behind" if any(own >= SOME and theirs < 0.5 * own for own, theirs in others) else "first"
 
 
-def _arm(table: Table, seen: list[_Seen], found: list[Guess], clock: int | None, given: Given) -> None:
+def _arm(table: Table, seen: list[Seen], found: list[Guess], clock: int | None, given: Given) -> None:
     """Find angle and command together."""
     free = [k for k, one in enumerate(seen) if not found[k].quantity and not found[k].why and not one.traits.constant]
     free = sorted(sorted(free, key=lambda k: -abs(seen[k].meaning.odds))[:MOST])
     every = max(len(table) // 2000, 1)
     numbers = {k: np.nan_to_num(table.columns[k].values[::every]) for k in free}
-    explained = _explained(table, seen, found, numbers)
+    explained = explain(table, seen, numbers)
     follows, loops = explained.odds, explained.loops
-    named = {k: (_named(seen[k], "theta"), _named(seen[k], "duty")) for k in free}
+    for k, why in explained.why.items():
+        found[k] = Guess(why=why)
+    named = {k: (says(seen[k], "theta"), says(seen[k], "duty")) for k in free}
     angle = {k: ANGLE[about_angle(seen[k].traits)] + follows.get(k, 0.0) for k in free}
     command = {k: COMMAND[about_angle(seen[k].traits)] + ONE_WAY * seen[k].traits.one_way + follows.get(k, 0.0)
                for k in free}
@@ -367,100 +331,7 @@ def _rival(best: float, others: dict[Any, float], none: int | None = None) -> in
     return (none if k is None else k) if others[k] > best - SURE else None
 
 
-@dataclass(frozen=True)
-class _Explained:
-    """Columns that are computed from others.
-
-    Attributes:
-        odds: [nats] log odds of angle or command for each.
-        loops: triples of which one is the difference of the others, as reference, angle and error.
-        late: late copies -> the column that they copy.
-    """
-
-    odds: dict[int, float]
-    loops: list[tuple[int, int, int]]
-    late: dict[int, int]
-
-
-def _explained(table: Table, seen: list[_Seen], found: list[Guess], numbers: dict[int, Floats]
-               ) -> _Explained:
-    """Recognise columns that are computed from others."""
-    odds: dict[int, float] = {}
-    late: dict[int, int] = {}
-    loops, errors = [], set()
-    for trio in differences(numbers):
-        k = _error_of(seen, numbers, trio)
-        found[k] = Guess(why="the difference of columns {} and {}".format(*(table.label(j) for j in trio if j != k)))
-        errors.add(k)
-        loops.append(trio)
-        odds |= {j: FOLLOWS for j in trio if j == k or seen[j].traits.holds or (  # the reference, then
-            seen[j].meaning.quantity == "reference")}
-    hidden = [k for k in numbers if not any(k in trio for trio in loops) and not seen[k].traits.holds
-              and seen[k].meaning.quantity not in ("theta", "duty", "voltage") and any(
-                  is_error(table.columns[k].values, table.columns[j].values)
-                  and (_named(seen[j], "theta") > 0.0 or (len(numbers) == 2 and k > j)) for j in numbers if j != k)]
-    for k in hidden:
-        found[k] = Guess(why="what is missing to a reference that jumps and holds")
-        odds[k] = FOLLOWS
-    rest = [k for k in numbers if k not in errors and k not in hidden]
-    said = {"same": "the same as", "filtered": "a filtered copy of", "late": "a late copy of",
-            "noisy": "a noisy copy of", "derivative": "a derivative of"}
-    for k, origin in _ordered(seen, origins([one.traits for one in seen], rest)).items():
-        commanded = [seen[j].meaning.quantity in ("duty", "voltage") for j in (k, origin.of)]
-        if origin.how in said and commanded != [True, False]:  # a controller makes its command of the angle
-            found[k] = Guess(why=f"{said[origin.how]} column {table.label(origin.of)}")
-            odds[k] = FOLLOWS
-            late |= {k: origin.of} if origin.how == "late" else {}
-    return _Explained(odds, loops, late)
-
-
-def _error_of(seen: list[_Seen], numbers: dict[int, Floats], trio: tuple[int, int, int]) -> int:
-    """Which of three columns is the error: by its name, or for it jumps with the reference, and does not hold."""
-    named = [k for k in trio if seen[k].meaning.quantity == "error"]
-    rest = named or [k for k in trio if seen[k].meaning.quantity not in ("theta", "reference", "duty")] or list(trio)
-    moving = [k for k in rest if not seen[k].traits.holds] or rest
-    if len(moving) == len(trio):  # a smooth reference: the error is small
-        return min(moving, key=lambda k: float(np.mean(numbers[k] ** 2)))
-    return max(moving, key=lambda k: float(np.abs(np.diff(numbers[k])).max()))
-
-
-def _ordered(seen: list[_Seen], found: dict[int, Origin]) -> dict[int, Origin]:
-    """Of two columns that follow from each other, that with the clearer name and unit stays."""
-    out = {}
-    for k, origin in found.items():
-        clearer = _clarity(seen[k]) > _clarity(seen[origin.of])
-        named = clearer and seen[origin.of].meaning.quantity not in ("", "theta", "duty")
-        if (origin.how == "same" and clearer) or named:
-            out[origin.of] = Origin(k, origin.how)
-        else:
-            out[k] = origin
-    return out
-
-
-def _clarity(one: _Seen) -> float:
-    return one.meaning.odds * (one.meaning.quantity in ("theta", "duty")) + bool(one.column.unit)
-
-
-def _named(one: _Seen, quantity: str) -> float:
-    """[nats] What name and unit say about a quantity."""
-    odds = 0.0
-    if one.meaning.quantity == quantity:
-        odds = one.meaning.odds
-    elif one.meaning.quantity == "voltage" and quantity == "duty":
-        odds = 0.0
-    elif one.meaning.quantity:
-        odds = -one.meaning.odds
-    unit = one.column.unit
-    if unit and unit not in ("1", "-"):
-        if known(quantity, unit) or (quantity == "theta" and unit.casefold() in ("counts", "ticks", "lsb")):
-            odds += STRONG
-        elif not (quantity == "duty" and (known("voltage", unit) or known("time", unit) == "us"
-                                          or unit.casefold() in ("counts", "ticks", "lsb"))):
-            odds -= STRONG
-    return odds
-
-
-def _contradictions(seen: list[_Seen], found: list[Guess], angle: dict[int, float],
+def _contradictions(seen: list[Seen], found: list[Guess], angle: dict[int, float],
                     named: dict[int, tuple[float, float]], a: int, b: int | None) -> tuple[str, str]:
     """Where names and numbers contradict each other, of angle and command; "" if they do not."""
     first = second = ""
@@ -477,7 +348,7 @@ def _contradictions(seen: list[_Seen], found: list[Guess], angle: dict[int, floa
     return first, second
 
 
-def _also(seen: list[_Seen], found: list[Guess], columns: Collection[int], chosen: int, quantity: str) -> str:
+def _also(seen: list[Seen], found: list[Guess], columns: Collection[int], chosen: int, quantity: str) -> str:
     """Whether another column has the name of a quantity too, and is not computed from others."""
     for k in columns:
         if k != chosen and seen[k].meaning == Meaning(quantity, STRONG) and not found[k].why:
@@ -486,7 +357,7 @@ def _also(seen: list[_Seen], found: list[Guess], columns: Collection[int], chose
     return ""
 
 
-def _reason(one: _Seen, quantity: str, *more: str) -> str:
+def _reason(one: Seen, quantity: str, *more: str) -> str:
     name = "its name" if one.meaning.quantity == quantity else ""
     unit = f"its unit, {one.column.unit}" if not name and known(quantity, one.column.unit) else ""
     said = SAID[about_angle(one.traits)]
@@ -501,7 +372,7 @@ def _unit(column: Column, quantity: str) -> str:
     return known(quantity, column.unit) or "" if column.unit else ""
 
 
-def _angle_scale(one: _Seen) -> scales.Scale:
+def _angle_scale(one: Seen) -> scales.Scale:
     said = _unit(one.column, "theta")
     named = not {"enc", "encoder", "pot", "adc", "potentiometer", "sensor", "raw", "counts"} & set(one.words)
     unit, why, sure = scales.of_angle(one.column.values, counts=one.counts,
@@ -513,11 +384,11 @@ def _angle_scale(one: _Seen) -> scales.Scale:
     return unit, why, sure
 
 
-def _is_voltage(one: _Seen) -> bool:
+def _is_voltage(one: Seen) -> bool:
     return one.meaning.quantity == "voltage" or bool(_unit(one.column, "voltage"))
 
 
-def _command_scale(one: _Seen, given: Given) -> scales.Scale:
+def _command_scale(one: Seen, given: Given) -> scales.Scale:
     x = one.column.values[np.isfinite(one.column.values)]
     low, top = float(x.min()), float(x.max())
     said = _unit(one.column, "duty")
@@ -536,7 +407,7 @@ def _command_scale(one: _Seen, given: Given) -> scales.Scale:
     return unit, why, sure
 
 
-def _constant_command(seen: list[_Seen], found: list[Guess]) -> None:
+def _constant_command(seen: list[Seen], found: list[Guess]) -> None:
     """A command that never changes, as in a free swing."""
     for k, one in enumerate(seen):
         if one.traits.constant and not found[k].why and one.meaning == Meaning("duty", STRONG):
@@ -549,7 +420,7 @@ def _constant_command(seen: list[_Seen], found: list[Guess]) -> None:
 # The other columns
 
 
-def _rest(one: _Seen, seen: list[_Seen], found: list[Guess]) -> Guess:
+def _rest(one: Seen, seen: list[Seen], found: list[Guess]) -> Guess:
     """A guess for a column that is neither time nor angle nor command."""
     if one.traits.constant:
         return Guess(why="it never changes")
@@ -573,7 +444,7 @@ def _rest(one: _Seen, seen: list[_Seen], found: list[Guess]) -> Guess:
     return Guess(quantity, scale, f"its name; {why}", sure)
 
 
-def _reference(one: _Seen, seen: list[_Seen], found: list[Guess]) -> Guess:
+def _reference(one: Seen, seen: list[Seen], found: list[Guess]) -> Guess:
     """A reference has the unit of the angle if it is near it."""
     for other, its in zip(seen, found):
         if its.quantity == "theta":
