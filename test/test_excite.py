@@ -150,7 +150,7 @@ def test_an_overdue_duty_is_left_out_not_sent_late(graph, start):
 BAD = {
     "kind": ("sweep", "one of latin_hypercube"),
     "duration": (-1.0, "give 0.01 to 3600 s"),
-    "duty_max": (1.5, "give 0 to 1"),
+    "duty_max": (1.5, "give -1 to 1"),
     "duty_min": (0.9, "duty_min < duty_max"),
     "hold_min": (5.0, "hold_min <= hold_max"),
     "levels": (2.5, "whole number"),

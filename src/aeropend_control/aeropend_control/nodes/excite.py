@@ -42,8 +42,8 @@ SETTINGS = {
     "kind": Setting(_DEFAULT.kind, "the signal", choices=tuple(KINDS)),
     "duration": Setting(_DEFAULT.duration, "length of the signal", "s", 0.01, 3600.0),
     "seed": Setting(_DEFAULT.seed, "the same seed gives the same signal", low=0, high=2**31 - 1),
-    "duty_min": Setting(_DEFAULT.duty_min, "least duty of latin_hypercube, staircase, multisine", low=0.0, high=1.0),
-    "duty_max": Setting(_DEFAULT.duty_max, "greatest duty of the same", low=0.0, high=1.0),
+    "duty_min": Setting(_DEFAULT.duty_min, "least duty of latin_hypercube, staircase, multisine", low=-1.0, high=1.0),
+    "duty_max": Setting(_DEFAULT.duty_max, "greatest duty of the same", low=-1.0, high=1.0),
     "hold_min": Setting(_DEFAULT.hold_min, "shortest hold of latin_hypercube", "s", SAMPLE_PERIOD, 600.0),
     "hold_max": Setting(
         _DEFAULT.hold_max,
@@ -54,8 +54,8 @@ SETTINGS = {
     ),
     "levels": Setting(_DEFAULT.levels, "intervals of latin_hypercube, stairs of staircase", low=2, high=1000),
     "rest": Setting(_DEFAULT.rest, "duty 0 after each hypercube, and after each lift of free_decay", "s", 0.0, 600.0),
-    "duty": Setting(_DEFAULT.duty, "duty of hold and free_decay", low=0.0, high=1.0),
-    "sequence": Setting(list(_DEFAULT.sequence), "duties of steps, repeated", low=0.0, high=1.0),
+    "duty": Setting(_DEFAULT.duty, "duty of hold and free_decay", low=-1.0, high=1.0),
+    "sequence": Setting(list(_DEFAULT.sequence), "duties of steps, repeated", low=-1.0, high=1.0),
     "frequencies": Setting(list(_DEFAULT.frequencies), "of multisine", "Hz", 1e-4, 0.5 / SAMPLE_PERIOD),
 }
 

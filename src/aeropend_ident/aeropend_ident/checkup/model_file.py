@@ -40,10 +40,11 @@ def checks(source: str) -> Iterator[Check]:
 
 
 def _limits(source: str, model: Model) -> Iterator[Check]:
-    """Values at the limit of their range, apart from 0, which means none."""
+    """Values at the limit of their range, apart from 0, which means none, and from 1 for a bridge that reverses."""
     for name, value in to_flat(model).items():
         p = PARAMETERS.get(name)
-        if p is not None and value != 0.0 and any(abs(value - end) <= AT_END * abs(end) for end in (p.low, p.high)):
+        at_end = p is not None and any(abs(value - end) <= AT_END * abs(end) for end in (p.low, p.high))
+        if p is not None and value != 0.0 and at_end and name != "model.reverse":
             yield warning(source, f"{name} = {value:g} is at the limit of its range, {p.low:g} to {p.high:g}: "
                           "a fit did not determine it")
 
