@@ -165,3 +165,10 @@ def test_an_arm_that_rests_at_first_gives_its_zero_to_a_reading():
     resting = recorded(theta, np.concatenate([np.zeros(rest), s.duty]))
     (found,) = mounted(BENCH, [resting])
     assert found.mounting.zero == 1.2
+
+
+def test_a_command_that_explains_nothing_does_not_turn_the_sign():
+    s = driven()
+    other = replace(s, duty=0.3 + 0.1 * np.sin(5.0 * np.arange(len(s)) * s.period))
+    (found,) = mounted(BENCH, [other])
+    assert not found.mounting.flipped

@@ -37,6 +37,10 @@ REST, FEWEST = 0.2, 5
 STILL = 5.0
 """Greatest distance of a reading at rest from the first ones, in standard deviations of a reading (choice)."""
 
+EXPLAINS = 1.1
+"""Least ratio of what a regression leaves without the command to what it leaves with it, to turn the sign.
+
+Measured: of 80 drawn rigs all have 1.1 or more, and the sign of each gain is right."""
 
 CLEARLY = 2.0
 """Least ratio of what a regression leaves with the zero as read to what one with a free zero leaves, to move the zero
@@ -53,7 +57,7 @@ def mounted(model: Model, recordings: Sequence[Signals]) -> list[Signals]:
         model: gives what the recordings do not determine.
         recordings: of one rig; those that are mounted already stay as they are.
     """
-    every, found = list(recordings), Mounting()
+    every = list(recordings)
     if any(s.mounting is not None for s in every) or not all(s.driven for s in every):
         return every
     rest = _at_rest(every[0])
@@ -66,7 +70,8 @@ def mounted(model: Model, recordings: Sequence[Signals]) -> list[Signals]:
         if abs(r.hangs_at) > OFF and _likeliest(model, moved, zero=False).left > CLEARLY * r.left:
             zero += -r.hangs_at if found.flipped else r.hangs_at
             zero += math.tau * round((middle - zero) / math.tau)  # of all turns that of the readings
-        found = Mounting(zero, found.flipped != (r.gain < 0.0))
+        turned = r.gain < 0.0 and _without_command(moved).left > EXPLAINS * r.left
+        found = Mounting(zero, found.flipped != turned)
     return [found.of(s).noted(*found.notes()) for s in every]
 
 
@@ -78,9 +83,15 @@ def _at_rest(s: Signals) -> float | None:
     moved = np.abs(x - np.median(x[:first])) > STILL * s.sigma["theta"]
     stop = int(np.argmax(moved)) if moved.any() else len(x)
     held = s.duty[:int(known[min(stop, len(known) - 1)])]
-    if stop < first or (held.max() >= NO_DUTY and np.ptp(held) < NO_DUTY):
+    if stop < first or (np.abs(held).max() >= NO_DUTY and np.ptp(held) < NO_DUTY):
         return None
     return float(np.median(x[:stop]))
+
+
+def _without_command(recordings: Sequence[Signals]) -> Regression:
+    """The regression of the weak form as if the command did nothing."""
+    tried = [downsampled(s) for s in recordings]
+    return regress([WeakForm(s) for s in tried], [np.zeros(len(s)) for s in tried])
 
 
 def _likeliest(model: Model, recordings: Sequence[Signals], *, zero: bool = True) -> Regression:
