@@ -323,20 +323,14 @@ def propose(table: Table, found: Sequence[Guess], chosen: dict[str, str], given:
 
 def _kept(arguments: Sequence[str], given: argparse.Namespace) -> list[str]:
     """The words of the command line that stay in the proposed one."""
-    paths = list(given.paths)
+    paths, columns = list(given.paths), [f"--{quantity}" for quantity in UNITS]
     kept: list[str] = []
-    for k, word in enumerate(arguments):
-        if word in paths and (not k or arguments[k - 1] != "--with"):
+    for before, word in zip(["", *arguments], arguments, strict=False):
+        if word in paths and before != "--with":
             paths.remove(word)
-        elif word != "--accept" and not _names_a_column([*arguments[k - 1:k], word]):
+        elif word != "--accept" and word.partition("=")[0] not in columns and before not in columns:
             kept.append(word)
     return kept
-
-
-def _names_a_column(words: Sequence[str]) -> bool:
-    """Whether the last word is an option for a column, or its value."""
-    options_ = [f"--{quantity}" for quantity in UNITS]
-    return words[-1].partition("=")[0] in options_ or words[0] in options_
 
 
 @entry_point("import")

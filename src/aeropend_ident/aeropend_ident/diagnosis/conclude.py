@@ -33,7 +33,7 @@ from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.signals import Mounting, Signals
 from aeropend_ident.signals.statistics import Z95
 from aeropend_sim.model.excitation import Excitation
-from aeropend_sim.model.parameters import DUTY_MAP, MODEL_NAMES, OPTIONAL, PARAMETERS, Model
+from aeropend_sim.model.parameters import DUTY_MAP, MODEL_NAMES, OPTIONAL, Model
 
 DETERMINED = 0.5
 """Share of a prior's width above which the recordings have not determined a parameter (choice)."""
@@ -69,10 +69,10 @@ def parameter_rows(chains: CutChains, joint: JointFit) -> dict[str, ParameterRow
     fitted = {p.name: p for stage in STAGES for p in model_parameters(chains, stage)}
     alone = angle_only(chains.recordings)
     rows: dict[str, ParameterRow] = {}
-    left_out = {key(name).name for name in (*OPTIONAL, *DUTY_MAP) if nominal[key(name).name] == 0.0}
+    left_out = {name for name in (*OPTIONAL, *DUTY_MAP) if nominal[name] == 0.0}
     for n in (name for name in MODEL_NAMES if name not in left_out):
-        limits = PARAMETERS[f"model.{n}"]
-        p = fitted.get(n, Parameter(n, nominal[n], UNCALIBRATED_SD, limits.low, limits.high, log=nominal[n] > 0.0))
+        ends = limits(n)
+        p = fitted.get(n, Parameter(n, nominal[n], UNCALIBRATED_SD, ends.low, ends.high, log=nominal[n] > 0.0))
         # with the angle alone, only the curve from duty to lift is identifiable, not its parameters
         known = n in fitted and (n in OF_THE_ARM or not alone)
         value = values.get(n, nominal[n])
@@ -80,7 +80,7 @@ def parameter_rows(chains: CutChains, joint: JointFit) -> dict[str, ParameterRow
         prior = p.sd * (value if p.log else 1.0)
         if p.log and value > 0.0:
             reach = math.exp(Z95 * spread / value)
-            between = Interval(value, max(value / reach, limits.low), min(value * reach, limits.high))
+            between = Interval(value, max(value / reach, ends.low), min(value * reach, ends.high))
         else:
             between = interval(value, spread, p.low, p.high)
         row = _row(nominal[n], between, known and spread < DETERMINED * prior)

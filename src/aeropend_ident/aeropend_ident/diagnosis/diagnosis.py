@@ -392,8 +392,7 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
                for c, x in _left(stages, gust=found.statistical.gust is not None).items() if x > GOOD_ENOUGH]
     reasons = [failed] if failed else reasons
     undecided = conclude.not_separable(chains, stages)
-    tried = EXPERIMENTS if calibrated else experiments_within(
-        max(float(np.abs(s.duty).max()) for s in found.recordings))
+    tried = EXPERIMENTS if calibrated else experiments_within(max(s.largest_duty for s in found.recordings))
     rows = conclude.parameter_rows(chains, joint)
     closed, low, high = closure(gaps.before, gaps.after, gaps.floors)
     places = gap_share.share_of_places(parts, lambda: _parts_of_parameters(joint, gaps))

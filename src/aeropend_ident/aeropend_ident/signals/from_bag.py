@@ -92,12 +92,10 @@ def as_signals(read: Recording, model: Model, held_out: float = 0.3, *, fit_nomi
     if jumps:
         said = f"theta jumps by a turn {counted(jumps, 'time')}, from an end of its range to the other: joined"
         read = replace(read, theta=theta, notes=(*read.notes, said))
-    read = _with_known_direction(read, reverses=fit_nominal or model.model["reverse"] > 0.0)
+    if float(np.nanmin(read.duty, initial=0.0)) < -STILL:
+        read = _driven_backward(read, reverses=fit_nominal or model.model["reverse"] > 0.0)
     if not fit_nominal:
         check_period(read)
-        if float(np.nanmin(read.duty, initial=0.0)) < -STILL and model.model["reverse"] == 0.0:
-            said = "the duty goes below 0: the bridge of this model brakes there (its parameter `reverse` is 0)"
-            read = replace(read, notes=(*read.notes, said))
         piece = longest_piece(with_voltage_as_command(read, model.model["v_full"]) if model.model["v_full"] else read)
         return from_recording(piece, model.sensing, held_out)
     if len(read) < FEWEST:
@@ -105,10 +103,17 @@ def as_signals(read: Recording, model: Model, held_out: float = 0.3, *, fit_nomi
     return from_uncalibrated(longest_piece(with_voltage_as_command(read)), model.sensing, held_out)
 
 
-def _with_known_direction(read: Recording, *, reverses: bool) -> Recording:
-    """A recording without the speed of a rotor that is driven both ways, if the readings do not tell its direction."""
-    backward = float(np.nanmin(read.duty, initial=0.0)) < -STILL
-    if not (backward and reverses and np.isfinite(read.omega).any() and np.nanmin(read.omega) >= 0.0):
+def _driven_backward(read: Recording, *, reverses: bool) -> Recording:
+    """A recording with duties below 0: a speed whose readings do not tell the direction is left out.
+
+    Args:
+        read: the recording.
+        reverses: whether the bridge reverses the motor there; else it brakes.
+    """
+    if not reverses:
+        said = "the duty goes below 0: the bridge of this model brakes there (its parameter `reverse` is 0)"
+        return replace(read, notes=(*read.notes, said))
+    if not np.isfinite(read.omega).any() or np.nanmin(read.omega) < 0.0:
         return read
     said = "omega: the motor is driven both ways, and its speed is read without a sign: left out"
     return replace(read, omega=np.full(len(read.omega), np.nan), notes=(*read.notes, said))

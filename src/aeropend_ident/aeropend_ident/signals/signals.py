@@ -155,10 +155,19 @@ class Signals:
         """Whether the motor is driven in both directions."""
         return bool(np.min(self.duty) < 0.0)
 
+    def turning(self, omega: Array) -> Array:
+        """A speed of the rotor (N,) that is at least 0, unless the motor is driven both ways."""
+        return omega if self.both_ways else np.maximum(omega, 0.0)
+
+    @property
+    def largest_duty(self) -> float:
+        """The largest duty, either way."""
+        return float(np.abs(self.duty).max())
+
     @property
     def driven(self) -> bool:
         """Whether a duty acts at any time."""
-        return bool(np.max(np.abs(self.duty)) >= STILL)
+        return self.largest_duty >= STILL
 
     def channel(self, name: str) -> Array:
         """A measured channel (N,) by name."""

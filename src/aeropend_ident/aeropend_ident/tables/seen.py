@@ -32,7 +32,7 @@ def look_at(table: Table) -> list[Seen]:
         x = column.values[np.isfinite(column.values)]
         decimals = table.lengths is not None and any("." in cell or "," in cell for cell in column.shown)
         out.append(Seen(column, _meaning(table, k), traits(column.values), tuple(words(column.name)),
-                         not decimals and bool((x == np.rint(x)).all())))
+                        not decimals and bool((x == np.rint(x)).all())))
     return out
 
 

@@ -2,8 +2,7 @@
 """Duty to voltage to speed to thrust in steady state, and the inverse functions for the controllers.
 
 All functions take and return scalars or arrays of one shape, in SI units. A duty is a fraction 0..1, or -1..1 if the
-bridge reverses or brakes the motor. `numbers` are the
-parameters of the model by name, from `Model.numbers`.
+bridge reverses or brakes the motor. `numbers` are the parameters of the model by name, from `Model.numbers`.
 """
 
 from __future__ import annotations

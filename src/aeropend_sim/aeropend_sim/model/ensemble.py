@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from aeropend_sim.compiled import njit
 from aeropend_sim.model.dynamics import Coefficients, Lag, State, advance, equation, prepare, steps_in
 from aeropend_sim.model.effects import PARAMETER_MISMATCH, is_active
-from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+from aeropend_sim.model.parameters import DUTY_MAP, SAMPLE_PERIOD, Model
 
 Array = NDArray[np.float64]
 
@@ -59,7 +59,6 @@ ROW = _Rows(*(sum(_HEIGHTS.get(name, 1) for name in _Rows._fields[:at]) for at i
 
 _LAGS = ("winding", "rotor")
 _SCALARS = ("h", "per_L", "K_e", "torque", "load", "drag", "k_thrust", "gravity", "damping", "lever")
-_MAP = ("k0", "k1", "k2", "k3")
 _STATE = ("i_a", "omega", "theta", "theta_dot", "thrust")
 
 
@@ -168,6 +167,6 @@ def _fill(rows: Array, model: Model, coefficients: Coefficients, state: State) -
     for name in _LAGS:
         at = getattr(ROW, name)
         rows[at:at + len(Lag._fields)] = getattr(coefficients, name)
-    for names, source in ((_SCALARS, coefficients._asdict()), (_MAP, numbers), (_STATE, state._asdict())):
+    for names, source in ((_SCALARS, coefficients._asdict()), (DUTY_MAP, numbers), (_STATE, state._asdict())):
         for name in names:
             rows[getattr(ROW, name)] = source[name]

@@ -81,10 +81,10 @@ PARAMETERS: dict[str, Parameter] = {
 """All parameters of a model file outside `effects`, as `section.name`."""
 
 
-OPTIONAL = ("model.v_full", "model.reverse")
+OPTIONAL = ("v_full", "reverse")
 """Parameters that a model file may leave out: they are 0 then."""
 
-DUTY_MAP = ("model.k0", "model.k1", "model.k2", "model.k3")
+DUTY_MAP = ("k0", "k1", "k2", "k3")
 """Parameters that a model file with `v_full` may leave out: it has no use for them, and they are 0."""
 
 
@@ -177,9 +177,9 @@ def from_flat(flat: Mapping[str, object], name: str = "model", base: Model | Non
             numbers[key] = _number(key, value, p.low, p.high, p.unit, name)
         else:
             raise _unknown("parameter", key, tuple(PARAMETERS), name)
-    numbers = {**dict.fromkeys(OPTIONAL, 0.0), **numbers}
+    numbers = {**{f"model.{key}": 0.0 for key in OPTIONAL}, **numbers}
     if numbers["model.v_full"] > 0.0:
-        numbers |= dict.fromkeys(DUTY_MAP, 0.0)
+        numbers |= {f"model.{key}": 0.0 for key in DUTY_MAP}
     missing = [key for key in PARAMETERS if key not in numbers]
     if missing:
         raise ModelError(f"{name}: {missing[0]} is missing ({len(missing)} in all); "
@@ -226,7 +226,7 @@ def to_flat(model: Model) -> dict[str, float]:
 def _given(model: Model) -> dict[str, float]:
     """The parameters of the plant that a file must give, and the others where they are not 0."""
     left_out = {*OPTIONAL, *(DUTY_MAP if model.model.get("v_full", 0.0) > 0.0 else ())}
-    return {key: value for key, value in model.model.items() if value != 0.0 or f"model.{key}" not in left_out}
+    return {key: value for key, value in model.model.items() if value != 0.0 or key not in left_out}
 
 
 def flatten(tree: Mapping[str, object], prefix: str = "") -> dict[str, object]:

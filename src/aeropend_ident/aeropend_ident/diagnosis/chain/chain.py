@@ -206,11 +206,7 @@ class CutChain:
         elif s.has("omega"):
             clean = partial(slow_part, width=round(SPEED_SETTLES / s.period), sigma=s.sigma["omega"])
             omega = omega + split_apply(clean, s.true_speed - omega, s.train)
-        self.speed = self._turning(omega)
-
-    def _turning(self, omega: Array) -> Array:
-        """A speed (N,) that is at least 0, unless the motor is driven both ways."""
-        return omega if self.signals.both_ways else np.maximum(omega, 0.0)
+        self.speed = s.turning(omega)
 
     # --- arm: speed -> angle
 
@@ -230,7 +226,7 @@ class CutChain:
         if not cut and not s.duty.any() and "initial.omega" not in values and actuator.voltage(n, 0.0) == 0.0:
             speed = np.zeros(len(s))[:stop]  # the rotor stands
         else:
-            speed = self.speed[:stop] if cut else self._turning(self.motor(values, stop)[1])
+            speed = self.speed[:stop] if cut else s.turning(self.motor(values, stop)[1])
         state = dynamics.State(omega=float(speed[0]), theta=values.get("initial.theta", 0.0),
                                theta_dot=values.get("initial.theta_dot", 0.0),
                                thrust=float(actuator.thrust(n, speed[0])))

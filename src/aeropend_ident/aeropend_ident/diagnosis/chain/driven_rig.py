@@ -197,7 +197,7 @@ def units_of(model: Model, recordings: Sequence[Signals]) -> Units:
 
     On a faster scale noise hides gravity, and it is found too small; on a slower one the arm only follows its duty.
     """
-    duty = 1.0 / max(float(np.abs(s.duty).max()) for s in recordings)
+    duty = 1.0 / max(s.largest_duty for s in recordings)
     found = []
     for octave in OCTAVES:
         units = Units(2.0**octave, duty)
@@ -401,7 +401,7 @@ def lift(model: Model, recordings: Sequence[Signals]) -> Lift:
         recordings: give the largest duty.
     """
     n = model.numbers()
-    duty = np.linspace(0.0, max(float(np.abs(s.duty).max()) for s in recordings), CURVE)
+    duty = np.linspace(0.0, max(s.largest_duty for s in recordings), CURVE)
     speed = actuator.speed_at(n, actuator.voltage(n, duty))
     middle = float(speed[CURVE // 2])
     pivot = dynamics.THRUST_PIVOT_SPEED

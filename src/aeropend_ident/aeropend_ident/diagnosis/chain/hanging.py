@@ -9,6 +9,7 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.weak_start import (
     BENDS,
@@ -25,6 +26,8 @@ from aeropend_ident.diagnosis.chain.weak_start import (
 from aeropend_ident.signals.signals import STILL as NO_DUTY
 from aeropend_ident.signals.signals import Mounting, Signals
 from aeropend_sim.model.parameters import Model
+
+Array = NDArray[np.float64]
 
 OFF = 0.25
 """[rad] Zero of the angle above which the readings are shifted; the fits find a smaller one.
@@ -64,14 +67,19 @@ def mounted(model: Model, recordings: Sequence[Signals]) -> list[Signals]:
     found = Mounting(rest if rest is not None and abs(rest) > OFF else 0.0)
     middle = float(np.nanmedian(np.concatenate([s.theta for s in every])))
     for _ in range(TIMES):
-        moved = [found.of(s) for s in every]
-        r = _likeliest(model, moved)
+        before = found
+        tried = [downsampled(found.of(s)) for s in every]
+        tests = [WeakForm(s) for s in tried]
+        lifts = _lifts(model, tried)
+        r = _likeliest(tests, lifts)
         zero = found.zero
-        if abs(r.hangs_at) > OFF and _likeliest(model, moved, zero=False).left > CLEARLY * r.left:
+        if abs(r.hangs_at) > OFF and _likeliest(tests, lifts, zero=False).left > CLEARLY * r.left:
             zero += -r.hangs_at if found.flipped else r.hangs_at
             zero += math.tau * round((middle - zero) / math.tau)  # of all turns that of the readings
-        turned = r.gain < 0.0 and _without_command(moved).left > EXPLAINS * r.left
+        turned = r.gain < 0.0 and regress(tests, [np.zeros(len(s)) for s in tried]).left > EXPLAINS * r.left
         found = Mounting(zero, found.flipped != turned)
+        if found == before:
+            break
     return [found.of(s).noted(*found.notes()) for s in every]
 
 
@@ -88,18 +96,13 @@ def _at_rest(s: Signals) -> float | None:
     return float(np.median(x[:stop]))
 
 
-def _without_command(recordings: Sequence[Signals]) -> Regression:
-    """The regression of the weak form as if the command did nothing."""
-    tried = [downsampled(s) for s in recordings]
-    return regress([WeakForm(s) for s in tried], [np.zeros(len(s)) for s in tried])
+def _lifts(model: Model, recordings: Sequence[Signals]) -> list[list[Array]]:
+    """The lift of each recording (N,), for each static curve and lag."""
+    curves = product(DEAD_ZONES, BENDS, LOADS[:1], LAGS)
+    models = [replace(model, model=curve(model.model, dead, bend, load, lag)) for dead, bend, load, lag in curves]
+    return [[unit_lift(m, s) for s in recordings] for m in models]
 
 
-def _likeliest(model: Model, recordings: Sequence[Signals], *, zero: bool = True) -> Regression:
-    """The regression of the weak form that leaves least, over static curves and lags; `zero`: whether it is unknown."""
-    tried = [downsampled(s) for s in recordings]
-    tests = [WeakForm(s) for s in tried]
-    found = []
-    for dead, bend, load, lag in product(DEAD_ZONES, BENDS, LOADS[:1], LAGS):
-        m = replace(model, model=curve(model.model, dead, bend, load, lag))
-        found.append(regress(tests, [unit_lift(m, s) for s in tried], zero=zero))
-    return min(found, key=lambda r: r.left)
+def _likeliest(tests: Sequence[WeakForm], lifts: Sequence[Sequence[Array]], *, zero: bool = True) -> Regression:
+    """The regression of the weak form that leaves least; `zero`: whether the zero of the angle is unknown."""
+    return min((regress(tests, own, zero=zero) for own in lifts), key=lambda r: r.left)

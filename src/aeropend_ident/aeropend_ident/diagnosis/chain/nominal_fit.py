@@ -42,7 +42,6 @@ from aeropend_ident.diagnosis.chain.weak_start import (
 )
 from aeropend_ident.diagnosis.policy import Policy, angle_only, policy_of
 from aeropend_ident.estimation.map_fit import Fit, fit
-from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.free_decay import turning_points
 from aeropend_ident.signals.noise import resolution
 from aeropend_ident.signals.signals import Signals
@@ -130,7 +129,7 @@ def _without_losses(chains: CutChains) -> list[CutChains]:
     full = float(duty @ v) / max(float(duty @ duty), 1e-12)
     if full <= 0.0:
         return []
-    numbers = {**chains.model.model, **{key(name).name: 0.0 for name in DUTY_MAP}, "v_full": full}
+    numbers = {**chains.model.model, **dict.fromkeys(DUTY_MAP, 0.0), "v_full": full}
     return [_cut_again(chains, replace(chains.model, model=numbers))]
 
 
@@ -202,7 +201,7 @@ def _start_of_arm(chains: CutChains) -> Model:
     for chain, s in zip(chains.each, coarse):
         every = max(1, round(s.period / chain.signals.period))
         speed = chain.speed if chain.signals.has("omega") or chain.signals.has("i_a") else chain.motor({})[1]
-        turning = speed if chain.signals.both_ways else np.maximum(speed, 0.0)
+        turning = chain.signals.turning(speed)
         lifts.append((turning * np.abs(turning))[::every][:len(s.theta)])
     tests = [WeakForm(replace(s, duty=np.zeros(len(s.theta)))) for s in coarse]
     r = regress(tests, lifts)

@@ -201,7 +201,7 @@ def _of_angle(model: Model, recordings: Sequence[Signals]) -> list[Parameter]:
     if free_swinging(recordings):
         return [*arm, Parameter(ZERO, model.effect("angle_offset", "bias"), 0.3)]
     own = [_of_effect(name, model) for name in held(model)]
-    full = max(float(actuator.voltage(m, max(float(np.abs(s.duty).max()) for s in recordings))), LEAST_VOLTAGE)
+    full = max(float(actuator.voltage(m, max(s.largest_duty for s in recordings))), LEAST_VOLTAGE)
     heaviest = HEAVIEST * (1.0 + HEAVIEST) * m["K_e"] ** 2 * m["K_t"] / (m["R_a"] * full)
     quickest = max(QUICKEST * slower, 0.6 * max(s.period for s in recordings)) * m["K_t"] * m["K_e"] / m["R_a"]
     rest = -m["k1"] * math.sqrt(m["k3"])  # a duty of 0 does not turn the rotor

@@ -9,19 +9,19 @@ import numpy as np
 
 from aeropend_ident.estimation.parameter import key
 from aeropend_sim.model.effects import CATALOGUE, EffectParameter
-from aeropend_sim.model.parameters import PARAMETERS, Model
+from aeropend_sim.model.parameters import DUTY_MAP, OPTIONAL, PARAMETERS, Model
 from aeropend_sim.model.parameters import Parameter as ModelParameter
 
 Values = Mapping[str, float]
 
 STAGES: dict[str, tuple[str, ...]] = {
-    "actuator": ("k0", "k1", "k2", "k3", "v_full", "reverse"),
+    "actuator": (*DUTY_MAP, *OPTIONAL),
     "motor": ("R_a", "L_a", "K_e", "K_t", "J_m", "B_m", "k_load"),
     "arm": ("k_thrust", "mgd_over_J", "c_over_J", "L_over_J"),
 }
 """The stages of the cut chain and the parameters of the model in each."""
 
-FEWEST_PARAMETERS = sum(map(len, STAGES.values())) - 2
+FEWEST_PARAMETERS = sum(map(len, STAGES.values())) - len(OPTIONAL)
 """Number of parameters of a model without `v_full` and `reverse` (derived)."""
 
 FILTER = "sensing.angle_filter_tau"

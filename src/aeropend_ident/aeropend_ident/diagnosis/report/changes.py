@@ -8,12 +8,9 @@ from dataclasses import dataclass
 
 from aeropend_ident.diagnosis.document import Change, DiagnosisDocument, Interval, Since
 from aeropend_ident.diagnosis.report.number_format import interval, percent, quantity
+from aeropend_ident.diagnosis.search.hypotheses import TOGETHER
 
 APPEARED = "was not there"
-CAUSES = {("mgd_over_J", "L_over_J", "c_over_J"): "a mass put on the arm, or taken off, changes these together",
-          ("k_load", "J_m"): "another propeller changes these together"}
-"""What a person may have done, by parameters that have changed; see `hypotheses.TOGETHER`."""
-
 UNSEEN = "perhaps as before: an effect that was not seen then, and a parameter in its place"
 
 
@@ -102,7 +99,7 @@ def lines(since: Since) -> list[str]:
 
 def cause(since: Since) -> str:
     """What a person may have done; "" if nothing is known to change these parameters."""
-    return next((text for names, text in CAUSES.items() if set(names) <= set(since.claimed)), "")
+    return next((text for names, text in TOGETHER.items() if set(names) <= set(since.claimed)), "")
 
 
 def described(c: Change) -> str:

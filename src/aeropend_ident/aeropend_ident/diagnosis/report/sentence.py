@@ -86,14 +86,14 @@ def verdict(document: DiagnosisDocument) -> list[Part]:
         beside = [Part(", beside "), *listed([*effects, *parameters])] if effects or parameters else []
         return [Part("The model lacks an effect that the catalogue does not contain, at this place: "
                      f"{document.where.place}"), *beside, Part(quiet)]
-    budget = document.closure.budget
-    if not effects and not parameters and reached not in ("nothing open", "most") and budget and (
-            budget.not_repeatable > MOST):
-        return [Part(f"No effect was found, but {open_} stays open; {percent(budget.not_repeatable)} is no function of "
-                     "duty and state.")]
     if not effects and not parameters:
-        return [Part("The model lacks nothing that this recording shows." if reached in ("nothing open", "most") else
-                     f"No effect was surely found, but {open_} stays open.")]
+        budget = document.closure.budget
+        if reached in ("nothing open", "most"):
+            return [Part("The model lacks nothing that this recording shows.")]
+        if budget is not None and budget.not_repeatable > MOST:
+            return [Part(f"No effect was found, but {open_} stays open; {percent(budget.not_repeatable)} is no "
+                         "function of duty and state.")]
+        return [Part(f"No effect was surely found, but {open_} stays open.")]
     if reached == "none" and not set(effects) <= RANDOM:
         several = len(effects) + len(parameters) > 1
         return [*listed([*effects, *parameters]), Part(f" {'fit' if several else 'fits'} the fitted part of the "

@@ -52,8 +52,9 @@ Choice: what sticks at once gives no gradient."""
 STICKING = ("coulomb_friction", "rotor_friction")
 """Effects that can stick."""
 
-TOGETHER = (("mgd_over_J", "L_over_J", "c_over_J"), ("k_load", "J_m"))
-"""Parameters that change together: a mass on the arm changes weight and inertia, another propeller load and inertia."""
+TOGETHER = {("mgd_over_J", "L_over_J", "c_over_J"): "a mass put on the arm, or taken off, changes these together",
+            ("k_load", "J_m"): "another propeller changes these together"}
+"""Parameters that change together, and what a person has done then."""
 
 SAME = 1e-6
 """Change of a residual, in units of a reading's noise, that is rounding (choice).
