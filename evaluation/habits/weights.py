@@ -32,7 +32,9 @@ def measure(count: int) -> None:
         rest = [c for c in columns if id(c) not in follow and c.role != "e"]
         for c in rest:
             others = [(gain(seen[id(o)], seen[id(c)]), gain(seen[id(c)], seen[id(o)])) for o in rest if o is not c]
-            right[f"chain: {about_chain(others)}"].append(c.role == "y")
+            elsewhere = max((gain(seen[id(x)], seen[id(z)]) for x in rest for z in rest
+                             if x is not z and c is not x and c is not z), default=0.0)
+            right[f"chain: {about_chain(others, elsewhere)}"].append(c.role == "y")
             if c.role != "y":
                 but_angle = [(gain(seen[id(c)], seen[id(o)]), gain(seen[id(o)], seen[id(c)]))
                              for o in rest if o is not c and o.role != "y"]

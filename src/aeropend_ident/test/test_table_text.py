@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from arm_tables import ANGLE, MAPPED, NUMBERS, TIME, comma, imported, lines, put, refused
+from arm_tables import ANGLE, DRIVEN, LONG, MAPPED, NUMBERS, PUSH, TIME, comma, imported, lines, put, refused
 
 from aeropend_ident.tables import files
 from aeropend_ident.tables.units import parse
@@ -49,11 +49,34 @@ def test_each_column_may_have_its_own_decimal_mark(tmp_path):
     assert table.notes == ("numbers have a decimal comma in column 1, in others a decimal point",)
 
 
-@pytest.mark.parametrize("head", ["t,x,u,spare", "t,x", "# t,x,u,spare"])
+@pytest.mark.parametrize("head", ["t,x,u,spare,more", "# t,x,u,spare"])
 def test_names_of_another_number_than_the_columns_are_not_used(tmp_path, head):
     table = files.read(put(tmp_path, head + "\n" + lines(TIME, ANGLE, ANGLE)))
     assert [column.name for column in table.columns] == ["", "", ""]
     assert "which belongs to which is not clear" in "".join(table.notes) or head.startswith("#")
+
+
+@pytest.mark.parametrize(("head", "named"), [
+    ("t;angle;duty;spare", ["t", "angle", "duty"]), ("no;t;angle;duty", ["t", "angle", "duty"]),
+    ("t;angle ref;angle;duty", ["t", "angle", "duty"]), ("angle;duty", ["", "angle", "duty"])])
+def test_numbers_tell_which_name_is_one_too_many_or_missing(tmp_path, head, named):
+    table = files.read(put(tmp_path, head + "\n" + lines(LONG, DRIVEN, PUSH, split=";")))
+    assert [column.name for column in table.columns] == named
+    assert "the numbers tell which belongs to which" in "".join(table.notes)
+
+
+def test_a_column_stays_without_a_name_where_two_are_as_likely(tmp_path):
+    head = "t;angle;duty;temp;spare"
+    table = files.read(put(tmp_path, head + "\n" + lines(LONG, DRIVEN, PUSH, 21.0 + 0.01 * LONG, split=";")))
+    assert [column.name for column in table.columns] == ["t", "angle", "duty", ""]
+    assert "but for column 4" in "".join(table.notes)
+
+
+def test_a_decimal_comma_is_seen_wherever_it_shows(tmp_path):
+    x = np.concatenate((np.full(500, 22.5), ANGLE))
+    rows = "".join(f"{k};{value:.3f}\n".replace(".", ",") for k, value in enumerate(x))
+    table = files.read(put(tmp_path, "k;angle\n" + rows))
+    np.testing.assert_allclose(table.columns[1].values, x, atol=1e-3)
 
 
 def test_cells_beside_a_table_need_no_names(tmp_path):

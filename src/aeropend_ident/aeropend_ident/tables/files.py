@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.tables import text
+from aeropend_ident.tables.align import align
 from aeropend_ident.tables.table import (
     MOST_BYTES,
     MOST_COLUMNS,
@@ -75,7 +76,7 @@ def read(path: Path, *, sheet: str | None = None, delimiter: str | None = None, 
         if sheet is not None and kind != "xlsx":
             raise TableError(f"{path}: is no workbook: leave --sheet away")
         if kind == "text":
-            return text.read_text(path, delimiter, decimal)
+            return align(text.read_text(path, delimiter, decimal))
         if path.stat().st_size > MOST_BYTES:
             raise TableError(f"{path}: is larger than {MOST_BYTES >> 30} GiB: split it")
         if kind == "xlsx":

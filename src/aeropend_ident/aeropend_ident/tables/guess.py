@@ -26,6 +26,9 @@ from aeropend_ident.tables.units import CLOCK, RPM, UNITS, known
 SURE = 2.5
 """[nats] Least distance of a sure guess from the next (choice: 12 to 1)."""
 
+SURE_UNNAMED = 3.0
+"""[nats] Likewise of an angle where no name says what angle and command are (choice: 20 to 1)."""
+
 MOST = 14
 """Greatest number of columns whose relations are examined (choice: all pairs are)."""
 
@@ -45,7 +48,7 @@ ONE_WAY = -1.5
 
 PAIR = {"much": 0.7, "much back": -0.9, "some": 0.0, "some back": -1.4, "little": -1.4, "little back": -2.2,
         "none": -3.3, "none back": -3.1}
-CHAIN = {"followed": -2.2, "last": 0.8}
+CHAIN = {"followed": -2.6, "followed a little": -1.0, "alone": -4.4, "last": 1.4}
 BEHIND = {"behind": -1.5, "first": 0.3}
 """[nats] Log odds of what is seen in the angle, in the command, in both, and in the chain of columns that predict each
 other, of which the angle is the last and the command the first (measured: `make habits ARGS=--weights`)."""
@@ -103,15 +106,24 @@ def guess(table: Table, given: Given | None = None) -> list[Guess]:
         table: the table.
         given: what the user says.
     """
-    given = given or Given()
+    return _guess(table, given or Given())[0]
+
+
+def log_odds(table: Table) -> float:
+    """[nats] How well the best guess of time, angle and command explains the names and the numbers."""
+    return _guess(table, Given())[1]
+
+
+def _guess(table: Table, given: Given) -> tuple[list[Guess], float]:
+    """A guess for each column, and the log odds of time, angle and command together."""
     seen = look_at(table)
     found = [_nothing(one) for one in seen]
-    clock = _clock(table, seen, found)
-    _arm(table, seen, found, clock, given)
+    clock, odds = _clock(table, seen, found)
+    odds += _arm(table, seen, found, clock, given)
     for k, one in enumerate(seen):
         if not found[k].quantity and not found[k].why:
             found[k] = _rest(one, seen, found)
-    return found
+    return found, odds
 
 
 def _nothing(one: Seen) -> Guess:
@@ -130,7 +142,7 @@ def time_of(table: Table) -> tuple[int, float | None] | None:
     """The column of the time, and the size of its unit [s], None if that is not clear; None without a time."""
     seen = look_at(table)
     found = [_nothing(one) for one in seen]
-    k = _clock(table, seen, found)
+    k, _ = _clock(table, seen, found)
     if k is None:
         return None
     column = table.columns[k]
@@ -138,12 +150,12 @@ def time_of(table: Table) -> tuple[int, float | None] | None:
     return k, UNITS["time"][unit] if unit and found[k].sure else None
 
 
-def _clock(table: Table, seen: list[Seen], found: list[Guess]) -> int | None:
-    """Find the time; returns its column."""
+def _clock(table: Table, seen: list[Seen], found: list[Guess]) -> tuple[int | None, float]:
+    """Find the time; returns its column and its log odds [nats]."""
     odds = {k: _clock_odds(one) for k, one in enumerate(seen) if not found[k].why}
     best = max(odds, key=lambda k: (odds[k], len(np.unique(table.columns[k].values)), -k), default=None)
     if best is None or odds[best] < WEAK:
-        return None
+        return None, 0.0
     one = seen[best]
     others = [k for k in odds if k != best and odds[k] >= WEAK]
     unit, why, sure = ("", "times of day", True) if one.column.is_clock else scales.of_time(
@@ -164,7 +176,7 @@ def _clock(table: Table, seen: list[Seen], found: list[Guess]) -> int | None:
     for k, other in enumerate(seen):
         if k != best and not found[k].why and other.traits.ramp:
             found[k] = Guess(why="it rises evenly, as a counter of rows")
-    return best
+    return best, odds[best]
 
 
 def _clock_odds(one: Seen) -> float:
@@ -222,13 +234,18 @@ def about_pair(forth: float, back: float) -> str:
     return how + " back" * (back > BACK * forth)
 
 
-def about_chain(others: list[tuple[float, float]]) -> str:
+def about_chain(others: list[tuple[float, float]], elsewhere: float = 0.0) -> str:
     """What is seen in the angle and all other columns: a key of `CHAIN`.
 
     Args:
         others: gains of each other column by the angle, and of the angle by it.
+        elsewhere: greatest gain of another column by any column but the angle.
     """
-    return "followed" if any(theirs >= MUCH and own < 0.5 * theirs for theirs, own in others) else "last"
+    followed = max((theirs for theirs, own in others if own < 0.5 * theirs), default=0.0)
+    if followed >= SOME:
+        return "followed" if followed >= MUCH else "followed a little"
+    alone = max((own for _, own in others), default=0.0) < LITTLE
+    return "alone" if alone and elsewhere >= MUCH else "last"
 
 
 def about_command(others: list[tuple[float, float]]) -> str:
@@ -240,8 +257,8 @@ def about_command(others: list[tuple[float, float]]) -> str:
     return "behind" if any(own >= SOME and theirs < 0.5 * own for own, theirs in others) else "first"
 
 
-def _arm(table: Table, seen: list[Seen], found: list[Guess], clock: int | None, given: Given) -> None:
-    """Find angle and command together."""
+def _arm(table: Table, seen: list[Seen], found: list[Guess], clock: int | None, given: Given) -> float:
+    """Find angle and command together; returns their log odds [nats]."""
     free = [k for k, one in enumerate(seen) if not found[k].quantity and not found[k].why and not one.traits.constant]
     free = sorted(sorted(free, key=lambda k: -abs(seen[k].meaning.odds))[:MOST])
     every = max(len(table) // 2000, 1)
@@ -256,7 +273,9 @@ def _arm(table: Table, seen: list[Seen], found: list[Guess], clock: int | None, 
                for k in free}
     gains = {(a, b): gain(seen[a].traits, seen[b].traits) for a in free for b in free if a != b}
     for k in free:
-        angle[k] += CHAIN[about_chain([(gains[j, k], gains[k, j]) for j in free if j != k and j not in follows])]
+        rest = [j for j in free if j != k and j not in follows]
+        angle[k] += CHAIN[about_chain([(gains[j, k], gains[k, j]) for j in rest],
+                                      max((gains[j, i] for j in rest for i in rest if i != j), default=0.0))]
     in_units = {k for k in free if known("theta", table.columns[k].unit)}
     for k in free if in_units else ():
         angle[k] -= WEAK * (not table.columns[k].unit) + STRONG * (k in in_units and not _angle_scale(seen[k])[2])
@@ -273,20 +292,23 @@ def _arm(table: Table, seen: list[Seen], found: list[Guess], clock: int | None, 
         moved = any(gains[k, j] >= SOME and j not in follows and (k, j) not in tracked
                     and seen[j].meaning.quantity not in OF_THE_ARM for j in free if j != k)
         both[k, None] = angle[k] + named[k][0] + MOVED * (moved or bool(loops))
+    likely = {k: angle[k] + named[k][0] for k in free}
     for k, j in gains:
         pair = PAIR[about_pair(gains[k, j], gains[j, k])]
         behind = BEHIND[about_command([(gains[j, i], gains[i, j]) for i in free if i not in (j, k, *follows)])]
         both[k, j] = (angle[k] + named[k][0] + command[j] + named[j][1] + pair + behind + prior
-                      + FOLLOWS * ((k, j) in tracked))
+                      + FOLLOWS * any(goal == j and likely[i] >= likely[k] for i, goal in tracked))
     if not both:
-        return
+        return 0.0
     a, b = max(both, key=lambda pair: both[pair])
     if both[a, b] < 0.0 and clock is None:
-        return
+        return 0.0
     same = {k for k in free if found[k].why.startswith("the same as")}
     rivals = {pair: odds for pair, odds in both.items() if not same & set(pair) - {a, b}}
     first, second = _contradictions(seen, found, angle, named, a, b)
-    rival = _rival(both[a, b], {pair[0]: odds for pair, odds in sorted(rivals.items(), key=lambda one: one[1])
+    unnamed = named[a][0] <= 0.0 and (b is None or named[b][1] <= 0.0)
+    least = both[a, b] - (SURE_UNNAMED if unnamed else SURE)
+    rival = _rival(least, {pair[0]: odds for pair, odds in sorted(rivals.items(), key=lambda one: one[1])
                                 if pair[0] != a})
     if rival is None and named[a][0] <= 0.0:  # the angle is a late copy of its reference, if the loop is good
         rival = next((k for k, of in explained.late.items() if of == a), None)
@@ -297,9 +319,9 @@ def _arm(table: Table, seen: list[Seen], found: list[Guess], clock: int | None, 
     if b is None:
         others = {k: odds for k, odds in others.items() if k is not None and (
             (gains[a, k] >= LITTLE and named[k][1] > -STRONG and k not in follows) or named[k][1] > 0.0)}
-        rival = _rival(both[a, b], others)
+        rival = _rival(least, others)
         movers = [k for k in free if k != a and gains[a, k] >= LITTLE and k not in follows and (a, k) not in tracked
-                  and seen[k].meaning.odds < STRONG]
+                  and named[k][1] >= (0.0 if gains[a, k] < SOME else -WEAK)]
         if rival is None and movers:
             rival = max(movers, key=lambda k: both[a, k])
         if rival is None:
@@ -307,28 +329,29 @@ def _arm(table: Table, seen: list[Seen], found: list[Guess], clock: int | None, 
         else:
             unit, scale, _ = _command_scale(seen[rival], given)
             found[rival] = Guess("duty", unit, f"perhaps; {scale}", False)
-        return
-    if named[b][1] >= WEAK:  # its owner calls it a command
-        others.pop(None)
+        return both[a, b]
+    if named[b][1] >= WEAK:  # its owner calls it a command, and others something else
+        others = {k: odds for k, odds in others.items() if k is not None and named[k][1] >= 0.0}
     if gains[a, b] < LITTLE:
         second = second or f"but column {table.label(a)} does not follow it"
-    rival = _rival(both[a, b], others, none=-1)
+    rival = _rival(both[a, b] - SURE, others, none=-1)
     doubt = second or ("" if rival is None else "or no command?" if rival < 0 else f"or column {table.label(rival)}?")
     unit, scale, clear = _command_scale(seen[b], given)
     how = "" if gains[a, b] < SOME else f"column {table.label(a)} follows it"
     volts = bool(_unit(seen[b].column, "voltage")) or seen[b].meaning == Meaning("voltage", STRONG)
     if volts and not given.supply and not doubt and np.nanmin(seen[b].column.values) >= 0.0:
         found[b] = Guess("voltage", unit, _reason(seen[b], "voltage", how, "the input, in V"), True)
-        return
+        return both[a, b]
     found[b] = Guess("duty", unit, _reason(seen[b], "duty", how, scale, doubt), clear and not doubt)
+    return both[a, b]
 
 
-def _rival(best: float, others: dict[Any, float], none: int | None = None) -> int | None:
-    """The column that may be meant as well; `none` stands for no column."""
+def _rival(least: float, others: dict[Any, float], none: int | None = None) -> int | None:
+    """The column that may be meant as well, with log odds above `least`; `none` stands for no column."""
     if not others:
         return None
     k = max(others, key=lambda key: others[key])
-    return (none if k is None else k) if others[k] > best - SURE else None
+    return (none if k is None else k) if others[k] > least else None
 
 
 def _contradictions(seen: list[Seen], found: list[Guess], angle: dict[int, float],

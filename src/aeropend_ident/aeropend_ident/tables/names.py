@@ -97,6 +97,13 @@ def words(text: str) -> list[str]:
     return [word.casefold() for word in _SPLIT.split(plain) if word]
 
 
+def whole_words(text: str) -> list[str]:
+    """The words of a name, or the one word that it was before it lost its letters with accents."""
+    parts = words(text)
+    lost = _without_lost_letters([part for part in parts if part not in OF_SIMULINK])
+    return [lost] if lost else parts
+
+
 def meaning(name: str, unit: str = "") -> Meaning:
     """The meaning of a column's name.
 
@@ -106,9 +113,7 @@ def meaning(name: str, unit: str = "") -> Meaning:
     """
     if unit and split_name(name)[0] != unit:
         name = split_name(name)[0]
-    parts = words(name)
-    lost = _without_lost_letters([part for part in parts if part not in OF_SIMULINK])
-    parts = [lost] if lost else parts
+    parts = whole_words(name)
     joined = "".join(parts)
     found = [Meaning(quantity, odds) for quantity, texts in WORDS.items()
              for odds, text in zip((STRONG, WEAK), texts) if _has(parts, joined, text.split())]

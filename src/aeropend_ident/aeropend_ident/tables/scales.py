@@ -70,7 +70,7 @@ def of_time(values: Floats, said: str, words: list[str]) -> Scale:
     named = said or next((unit for word, unit in NAMED.items() if word in words), "")
     if named:
         plain = known("time", named) or named
-        possible = 0.1 <= 1.0 / (rows * UNITS["time"][plain]) <= 1e5
+        possible = 0.1 <= 1.0 / (rows * UNITS["time"][plain]) <= 1e5 if said else plain in fits
         return "" if said else plain, f"in {named}" if possible else f"in {named}, {step:.4g} apart?", possible
     if x[0] in (0.0, 1.0) and (steps == 1.0).all():
         return "", "steps of 1: a counter of rows, or ms?", False

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aeropend_ident.tables.names import STRONG, Meaning, meaning, words
+from aeropend_ident.tables.names import STRONG, Meaning, meaning, whole_words
 from aeropend_ident.tables.table import Column, Table
 from aeropend_ident.tables.traits import Traits, traits
-from aeropend_ident.tables.units import known
+from aeropend_ident.tables.units import known, split_name
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +31,15 @@ def look_at(table: Table) -> list[Seen]:
     for k, column in enumerate(table.columns):
         x = column.values[np.isfinite(column.values)]
         decimals = table.lengths is not None and any("." in cell or "," in cell for cell in column.shown)
-        out.append(Seen(column, _meaning(table, k), traits(column.values), tuple(words(column.name)),
+        out.append(Seen(column, _meaning(table, k), traits(column.values), tuple(whole_words(column.name)),
                         not decimals and bool((x == np.rint(x)).all())))
     return out
 
 
 def _meaning(table: Table, k: int) -> Meaning:
     """What the name of a column means; that of a matrix does not tell which of its columns is which."""
-    name, columns = table.columns[k].name, [column.name for column in table.columns]
+    columns = [split_name(column.name)[0] if column.unit else column.name for column in table.columns]
+    name = columns[k]
     series = name.rstrip("0123456789")
     if series != name and sum(other.rstrip("0123456789") == series != other for other in columns) > 2:
         return Meaning()  # x1, x2, x3
@@ -48,7 +49,7 @@ def _meaning(table: Table, k: int) -> Meaning:
         return Meaning()
     if name.endswith("]") and same[1:] and name == same[0]:
         return Meaning()  # the time, where there are two
-    return meaning(name, table.columns[k].unit)
+    return meaning(table.columns[k].name, table.columns[k].unit)
 
 
 def says(one: Seen, quantity: str) -> float:

@@ -71,6 +71,7 @@ class Table:
         bad: (K,) rows with a different number of cells.
         complaint: message on the first of these rows, one line.
         notes: on the reading of the file, one line each.
+        head: names that the columns do not have, because there are more or fewer of them than columns.
     """
 
     path: Path
@@ -80,6 +81,7 @@ class Table:
     lengths: Ints | None = None
     bad: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     complaint: str = ""
+    head: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of rows."""

@@ -73,7 +73,7 @@ class Dialect:
         names, units: of the columns; "" where there are none.
         clocks: whether a column holds times of day.
         texts: whether a column holds hardly any number.
-        note: on names that do not fit the columns; "" if they do.
+        head: names whose number is not that of the columns, which therefore have none.
     """
 
     delimiter: str
@@ -84,7 +84,7 @@ class Dialect:
     units: tuple[str, ...] = ()
     clocks: tuple[bool, ...] = ()
     texts: tuple[bool, ...] = ()
-    note: str = ""
+    head: tuple[str, ...] = ()
 
 
 def number(cell: str, decimal: str) -> float | None:
@@ -132,14 +132,15 @@ def read_text(path: Path, delimiter: str | None = None, decimal: str | None = No
         raise TableError(f"{path}: is larger than {MOST_BYTES >> 30} GiB: split it")
     encoding, notes = _encoding(path)
     sample = [line for line, _ in zip(_lines(path, encoding), range(SAMPLE))]
-    dialect = _head(path, sample, _dialect(path, sample, delimiter, decimal))
+    dialect = _dialect(path, sample, delimiter, decimal)
+    if decimal is None:
+        _check_marks(path, dialect, _lines(path, encoding))
+    dialect = _head(path, sample, dialect)
     commas = [k for k, mark in enumerate(dialect.decimals) if mark == ","]
     if commas:
         where = "" if len(commas) == dialect.width else f" in column{'s' * (len(commas) > 1)} " + ", ".join(
             f"{k + 1}" for k in commas) + ", in others a decimal point"
         notes.append(f"numbers have a decimal comma{where}")
-    if dialect.note:
-        notes.append(dialect.note)
     return _Reading(path, dialect, notes).table(_lines(path, encoding))
 
 
@@ -226,8 +227,6 @@ def _dialect(path: Path, sample: Sequence[str], delimiter: str | None, decimal: 
             best = score, Dialect(d, marks, width)
     assert best is not None
     (share, _, _), found = best
-    if decimal is None:
-        _check_marks(path, found, [split(line, found.delimiter) for line in lines])
     if share == 0.0 or (share < READABLE and found.width == 1):
         raise TableError(f"{path}: no table of numbers is found in it")
     return found
@@ -244,12 +243,19 @@ def _marks(readable: Sequence[Mapping[str, int]]) -> tuple[str, ...]:
     return tuple(max(one, key=lambda mark: one[mark]) if len(set(one.values())) > 1 else usual for one in readable)
 
 
-def _check_marks(path: Path, dialect: Dialect, rows: Sequence[Sequence[str]]) -> None:
-    """Refuse commas that may be decimal commas or mark thousands."""
-    commas = [cell for row in rows for cell, mark in zip(row, dialect.decimals)
-              if mark == "," and "," in cell and _COMMA_NUMBER.match(cell)]
-    if commas and all(_MAYBE_THOUSANDS.match(cell) for cell in commas):
-        raise TableError(f"{path}: '{commas[0]}' may have a decimal comma or mark thousands: say --decimal , or write "
+def _check_marks(path: Path, dialect: Dialect, lines: Iterator[str]) -> None:
+    """Refuse commas that may be decimal commas or mark thousands in every line of the file."""
+    first = ""
+    for line in lines if "," in dialect.decimals else ():
+        if _is_comment(line):
+            continue
+        for cell, mark in zip(split(line, dialect.delimiter), dialect.decimals):
+            if mark == "," and "," in cell and _COMMA_NUMBER.match(cell):
+                if not _MAYBE_THOUSANDS.match(cell):
+                    return
+                first = first or cell
+    if first:
+        raise TableError(f"{path}: '{first}' may have a decimal comma or mark thousands: say --decimal , or write "
                          "the numbers without marks of thousands")
 
 
@@ -276,15 +282,15 @@ def _head(path: Path, sample: Sequence[str], dialect: Dialect) -> Dialect:
     if above and all(not cell or is_unit(without_brackets(cell)) for cell in above[-1]) and any(above[-1]):
         units = [without_brackets(cell) for cell in above.pop()]
     names = above[-1] if above else _commented(sample[: first - 1], dialect, used)
-    names, note = _named(names, dialect.width, used)
+    names, head = _named(names, dialect.width, used)
     own = [split_name(name)[1] for name in names]
     units = (units + [""] * dialect.width)[: dialect.width]
     return Dialect(dialect.delimiter, dialect.decimals, dialect.width, first, tuple(names),
-                   tuple(line or name for line, name in zip(units, own)), tuple(clocks), tuple(texts), note)
+                   tuple(line or name for line, name in zip(units, own)), tuple(clocks), tuple(texts), head)
 
 
-def _named(names: list[str], width: int, used: int) -> tuple[list[str], str]:
-    """A name for each column, and a note: names of another number than the columns say nothing about which is which.
+def _named(names: list[str], width: int, used: int) -> tuple[list[str], tuple[str, ...]]:
+    """A name for each column; or no names for the columns, and the names whose number is not that of the columns.
 
     Args:
         names: in the file.
@@ -295,9 +301,8 @@ def _named(names: list[str], width: int, used: int) -> tuple[list[str], str]:
     while names and not names[-1]:
         names = names[:-1]
     if names and cells != width and len(names) != used:
-        return [""] * width, (f"{counted(len(names), 'name')} ({', '.join(names)}) for {counted(used, 'column')}: "
-                              "which belongs to which is not clear, so that columns have numbers only")
-    return names + [""] * (width - len(names)), ""
+        return [""] * width, tuple(names)
+    return names + [""] * (width - len(names)), ()
 
 
 def _fits(row: Sequence[str], width: int) -> bool:
@@ -448,4 +453,5 @@ class _Reading:
         while len(columns) > 1 and not columns[-1].shown and not columns[-1].name:
             columns.pop()  # a delimiter at the end of each line
         return Table(self.path, tuple(columns), np.array(self.numbers, dtype=np.int64), tuple(self.notes),
-                     np.array(self.lengths, dtype=np.int64), np.array(self.bad, dtype=np.int64), self.complaint)
+                     np.array(self.lengths, dtype=np.int64), np.array(self.bad, dtype=np.int64), self.complaint,
+                     self.dialect.head)
