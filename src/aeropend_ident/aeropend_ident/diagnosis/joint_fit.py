@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +88,7 @@ class JointFit:
     values: dict[str, float]
     sd: dict[str, float]
     checks: dict[str, Check]
+    _fitted_without: dict[frozenset[str], dict[str, float]] = field(default_factory=dict, repr=False)
 
     @property
     def parameters(self) -> dict[str, Parameter]:
@@ -97,8 +98,15 @@ class JointFit:
     def without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         """The values that leave the smallest gap without some of the effects.
 
-        Calibrated parameters stay within their priors. What comes back is what no other parameter could take over.
+        Calibrated parameters stay within their priors. What comes back is what no other parameter could take over. The
+        values are fitted once.
         """
+        names = frozenset(h.name for h in effects)
+        if names not in self._fitted_without:
+            self._fitted_without[names] = self._fit_without(effects)
+        return self._fitted_without[names]
+
+    def _fit_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         rest = {stage: replace(f, found=tuple(s for s in f.found if s[0].hypothesis not in effects))
                 for stage, f in self.findings.items()}
         parameters = [replace(p, sd=FREER * p.sd) for p in _parameters(self.chains, rest).values()]
