@@ -25,10 +25,13 @@ from aeropend_ident.diagnosis.search.hypotheses import (
     stages_of,
 )
 from aeropend_ident.diagnosis.search.selection import (
+    ALIKE,
     CONTENDERS,
+    FORM_SHOWS,
     ROUNDS,
     SelectionRound,
     log_evidence_over,
+    mean_square,
     squared_gap,
 )
 from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess
@@ -216,7 +219,7 @@ def _with_better_rivals(chains: CutChains, findings: Findings, nominal: list[Par
             ess = largest_ess([findings.final, f])
             odds = rival.hypothesis.log_odds - selection[0].hypothesis.log_odds
             gain = f.log_evidence(ess) - findings.final.log_evidence(ess) + odds
-            if gain > 0.0:
+            if gain > 0.0 and not _needs_more(chains, findings, selection[0].hypothesis, rival.hypothesis, f):
                 sure = float(expit(gain))
                 others = [replace(r, probability=1.0 - sure if r is selection[0] else 0.0) for r in selection
                           if r is not rival]
@@ -225,6 +228,12 @@ def _with_better_rivals(chains: CutChains, findings: Findings, nominal: list[Par
                 findings = replace(findings, found=found, final=f)
                 break
     return findings
+
+
+def _needs_more(chains: CutChains, findings: Findings, found: Hypothesis, rival: Hypothesis, f: Fit) -> bool:
+    """Whether a rival has more parameters than the effect that was found, and leaves a gap alike."""
+    left, theirs = (squared_gap(chains, x, CHANNELS_OF[findings.stage]) for x in (findings.final, f))
+    return len(rival.own) > len(found.own) and mean_square(f, findings.stage) >= FORM_SHOWS and left <= ALIKE * theirs
 
 
 def _without_unneeded(chains: CutChains, findings: Findings, nominal: list[Parameter]) -> Findings:

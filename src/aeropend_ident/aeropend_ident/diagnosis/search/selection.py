@@ -61,6 +61,13 @@ FORM_SHOWS = 1.2
 
 Measured: ×0.7 changes 1 of 22 verdicts, ×1.3 none (docs/results/thresholds.md)."""
 
+ALIKE = 2.0
+"""Ratio of the squared gaps that are left up to which hypotheses are alike (derived: they then differ by less than what
+no hypothesis explains)."""
+
+FEWER = 1.1
+"""[nats] Log odds of a hypothesis over an alike one with more parameters, at least (choice: 3 to 1)."""
+
 MISPLACED = 2.0
 """Standard deviations of its prior beyond which a parameter is tried as a mismatch in any case.
 
@@ -202,12 +209,15 @@ class SelectionRound:
         """Log evidence of each over no further effect, and probabilities; the best first."""
         gains = [x + h.log_odds for (h, _), x in zip(tried, self._gains(tried, Fit.log_evidence), strict=True)]
         first = self._close_most(tried)
+        frugal = self._frugal(tried, gains)
+        needless = {h.name for (h, _), g, f in zip(tried, gains, frugal, strict=True) if f < g}
+        gains = frugal
         weights = np.where([*first, True], [*gains, 0.0], -np.inf)
         weights = np.exp(weights - weights.max())
         probability = weights / weights.sum()
         ranked = [RankedHypothesis(h, f, g, float(p)) for (h, f), g, p in zip(tried, gains, probability, strict=False)]
         order = sorted(range(len(tried)), key=lambda j: (not first[j], -gains[j]))
-        return tuple(self._ranked_by_place([ranked[j] for j in order]))
+        return tuple(self._ranked_by_place([ranked[j] for j in order], needless))
 
     def _close_most(self, tried: FittedHypotheses) -> list[bool]:
         """Whether no other hypothesis leaves a materially smaller gap in this stage: evidence decides only among these.
@@ -217,6 +227,19 @@ class SelectionRound:
         left = [self.left_open(f) for _, f in tried]
         most = min(left, default=0.0) + MATERIAL_SHARE * self.left_open(self.current)
         return [x <= most for x in left]
+
+    def _frugal(self, tried: FittedHypotheses, gains: list[float]) -> list[float]:
+        """The gains, where of alike hypotheses that with fewer parameters is the likelier one.
+
+        If no hypothesis explains all, other imperfections are left. A further parameter then describes some of them: it
+        has much more evidence, but closes hardly more of the gap.
+        """
+        left = [self.left_open(f) for _, f in tried]
+        if min((mean_square(f, self.stage) for _, f in tried), default=0.0) < FORM_SHOWS:
+            return gains
+        alike = [j for j, x in enumerate(left) if x <= ALIKE * min(left)]
+        simpler = {j: [gains[i] - FEWER for i in alike if len(tried[i][0].own) < len(tried[j][0].own)] for j in alike}
+        return [min(g, *simpler[j]) if simpler.get(j) else g for j, g in enumerate(gains)]
 
     def left_open(self, f: Fit) -> float:
         """What a fit leaves of the squared gap in this stage."""
@@ -243,16 +266,20 @@ class SelectionRound:
         return [of(f, ess) - of(self.current, ess)
                 - sum(later[b] for b in self.acts_on[h.name] if b != self.stage) for h, f in tried]
 
-    def _ranked_by_place(self, ranked: list[RankedHypothesis]) -> list[RankedHypothesis]:
+    def _ranked_by_place(self, ranked: list[RankedHypothesis], needless: Collection[str]) -> list[RankedHypothesis]:
         """Decide between close rivals at different places if none of them explains the whole misfit.
 
         The true effect then has another form than the catalogue's. Each rival is given free curves at its own place.
         The right one needs them for its form only. A wrong one cannot correct, from its place, an error that arises
         elsewhere. The likelihoods with free curves divide the total probability of the close rivals.
+
+        Args:
+            ranked: the best first.
+            needless: names of those that an alike one with fewer parameters replaces; they are no rivals.
         """
         best = mean_square(ranked[0].fit, self.stage)
         close = [r for r in ranked[:CONTENDERS] if r.gain > max(ranked[0].gain - CLOSE_GAIN, 0.0)
-                 and mean_square(r.fit, self.stage) < CLOSE * best]
+                 and r.hypothesis.name not in needless and mean_square(r.fit, self.stage) < CLOSE * best]
         if best < FORM_SHOWS or len({r.hypothesis.place for r in close}) < 2:
             return ranked
         left: list[tuple[float, float]] = []
