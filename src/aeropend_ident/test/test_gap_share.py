@@ -17,7 +17,16 @@ def part(name, amount, place="arm", unsure=0.0, windows=10):
 def test_shares_are_parts_of_the_whole_gap_the_unexplained_rest_included():
     found = shares([part("coulomb_friction", 3.0), part("brush_drop", 1.0), part("", 1.0)])
     assert {name: s.value for name, s in found.items()} == {"coulomb_friction": 0.6, "brush_drop": 0.2}
+    found = shares([part("coulomb_friction", 3.0), part("brush_drop", 1.0), part("", 1.0)], shared=0.0)
     assert all(s.low == pytest.approx(s.value) == pytest.approx(s.high) for s in found.values())
+
+
+def test_what_is_unexplained_widens_the_interval_of_a_share():
+    widths = [(s := shares([part("gust", 1.0), part("", rest)])["gust"]).high - s.low for rest in (0.0, 0.05, 0.5)]
+    assert widths[0] < 1e-9 < 0.05 < widths[1] < widths[2] < 1.0
+    # the amplitude is sqrt(2/3), give or take 1.96 times half of sqrt(1/3)
+    found = shares([part("gust", 1.0), part("", 0.5)])["gust"]
+    assert found.low == pytest.approx((np.sqrt(2 / 3) - 0.98 * np.sqrt(1 / 3)) ** 2, abs=0.03)
 
 
 def test_an_uncertain_size_and_a_gap_that_varies_widen_the_interval():
@@ -52,8 +61,8 @@ def test_false_captures_do_not_count_in_the_shares_of_others():
     ([part("gust", 2.0), part("brush_drop", 0.01)], "gust", ["gust"], ["brush_drop"]),
     ([part("gust", 2.0), part("brush_drop", -1.0)], "gust", ["gust"], ["brush_drop"]),
     ([part("gust", 2.0), part(UNKNOWN, 1.0, "thrust")], "gust", ["gust"], []),
-    ([part("gust", 1.0), part(UNKNOWN, 2.0, "thrust")], "unknown", ["gust"], []),
-    ([part("gust", 0.6), part("brush_drop", 0.6), part(UNKNOWN, 1.3, "thrust")], "unknown", ["gust", "brush_drop"], []),
+    ([part("gust", 1.0), part(UNKNOWN, 2.0, "thrust")], "unknown", [], ["gust"]),
+    ([part("gust", 0.6), part("brush_drop", 0.6), part(UNKNOWN, 1.3, "thrust")], "unknown", [], ["gust", "brush_drop"]),
     ([part(UNKNOWN, 0.0, "thrust")], "none", [], []),
 ])
 def test_the_verdict_is_the_largest_part(parts, verdict, effects, small):
