@@ -96,8 +96,11 @@ def limits(out: Path, labels: list[dict[str, Any]], jobs: int) -> dict[str, Any]
 
 
 def _other_rigs(options: argparse.Namespace, steps: list[str]) -> None:
+    def one_row(*given: Any) -> None:
+        circumstances.make_all(*given, only=options.row)
+
     name, make_all, report_, fit_nominal = (
-        ("circumstances", circumstances.make_all, circumstances.report, False) if options.circumstances else
+        ("circumstances", one_row, circumstances.report, False) if options.circumstances else
         ("unknown", uncalibrated.make, uncalibrated.report, True))
     out = options.out / name
     if "make" in steps:
@@ -129,6 +132,8 @@ def main() -> None:
                         help="uncalibrated rigs: angle and command alone, and free decays")
     parser.add_argument("--circumstances", action="store_true",
                         help="rigs with many small imperfections, in closed loop, with wrong noise and lost samples")
+    parser.add_argument("--row", choices=list(circumstances.ROWS), default="", metavar="CIRCUMSTANCE",
+                        help="only this circumstance, as messy")
     parser.add_argument("--pairs", action="store_true",
                         help="pairs of recordings of one rig between which something was changed, or nothing")
     parser.add_argument("--docs", action="store_true",

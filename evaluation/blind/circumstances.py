@@ -224,12 +224,12 @@ def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing
     return label, {**plant.measured(p, y, v, own, rng), "duty": applied}, lost
 
 
-def plan(count: int, seed: int) -> list[tuple[str, list[str]]]:
-    """Circumstance and effects of each recording."""
+def plan(count: int, seed: int, only: str = "") -> list[tuple[str, list[str]]]:
+    """Circumstance and effects of each recording; of one circumstance alone if `only` names it."""
     rng = np.random.default_rng([seed, 23])
     in_turn = {"closed loop": [*EFFECTS, "parameter_mismatch"], "other rigs": other_rigs.EFFECTS, **changes.ROWS}
     rows: list[tuple[str, list[str]]] = []
-    for row, part in ROWS.items():
+    for row, part in ({only: 1.0} if only else ROWS).items():
         for k in range(round(part * count)):
             effects: list[str] = []
             scalable = [e for e in EFFECTS if e not in RANDOM_OR_STEPPED]
@@ -244,7 +244,7 @@ def plan(count: int, seed: int) -> list[tuple[str, list[str]]]:
     return rows
 
 
-def make_all(out: Path, count: int, seed: int, duration: float, jobs: int) -> None:
+def make_all(out: Path, count: int, seed: int, duration: float, jobs: int, only: str = "") -> None:
     """Make the recordings, and seal their labels."""
     nominal = load(folder.MODEL)
 
@@ -259,7 +259,7 @@ def make_all(out: Path, count: int, seed: int, duration: float, jobs: int) -> No
         bags.write(out / "recordings" / f"c{k:03d}", columns, round(PERIOD * 1e9), lost)
         return {"name": f"c{k:03d}", **label}
 
-    folder.make_all(out, plan(count, seed), one, jobs)
+    folder.make_all(out, plan(count, seed, only), one, jobs)
 
 
 @dataclass(frozen=True)
