@@ -113,7 +113,7 @@ def main() -> int:
     of_all = found["all"].count("right") / len(found["all"])
     print(f"right without options, of those to be known: {100.0 * right:.0f} % (at least {100.0 * RIGHT:.0f} %), "
           f"of all: {100.0 * of_all:.0f} %\n"
-          f"right or asked: {100.0 * good:.0f} % ({100.0 * ASKED:.0f} %)")
+          f"right or asked: {100.0 * good:.1f} % ({100.0 * ASKED:.0f} %), wrong: {found['all'].count('wrong')}")
     return int(right < RIGHT or good < ASKED)
 
 
