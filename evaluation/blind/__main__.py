@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -96,11 +97,9 @@ def limits(out: Path, labels: list[dict[str, Any]], jobs: int) -> dict[str, Any]
 
 
 def _other_rigs(options: argparse.Namespace, steps: list[str]) -> None:
-    def one_row(*given: Any) -> None:
-        circumstances.make_all(*given, only=options.row)
-
     name, make_all, report_, fit_nominal = (
-        ("circumstances", one_row, circumstances.report, False) if options.circumstances else
+        ("circumstances", partial(circumstances.make_all, only=options.row), circumstances.report, False)
+        if options.circumstances else
         ("unknown", uncalibrated.make, uncalibrated.report, True))
     out = options.out / name
     if "make" in steps:

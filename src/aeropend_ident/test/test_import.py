@@ -71,7 +71,7 @@ def test_a_proposal_for_columns_without_names(tmp_path, capsys):
 
 @pytest.mark.promise("Tables", "`import` shows the columns of a file and proposes their meaning")
 @pytest.mark.parametrize(("text", "says"), [
-    ("t,angle 1,angle 2\n" + lines(TIME, ANGLE, driven(0.0 * TIME + 50.0)), "says theta too"),
+    ("t,angle 1,angle 2\n" + lines(TIME, ANGLE, driven(0.0 * TIME + 50.0)), "the name of column 2 says theta too"),
     ("t,angle\n" + lines(TIME, ANGLE / 15.0), "rad or deg?"),
     ("t,angle\n" + "".join(f"{t:.2f},{x:.0f}\n" for t, x in zip(TIME, ANGLE)), "deg, or counts of a turn?"),
     ("t,angle,pwm\n" + "".join(f"{t:.2f},{x:.2f},{u:.0f}\n" for t, x, u in zip(LONG, DRIVEN, PUSH)),

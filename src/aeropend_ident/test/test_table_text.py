@@ -49,7 +49,7 @@ def test_each_column_may_have_its_own_decimal_mark(tmp_path):
     assert table.notes == ("numbers have a decimal comma in column 1, in others a decimal point",)
 
 
-@pytest.mark.parametrize("head", ["t,x,u,spare,more", "# t,x,u,spare"])
+@pytest.mark.parametrize("head", ["t,x,u,spare,more", "t,x", "# t,x,u,spare"])
 def test_names_of_another_number_than_the_columns_are_not_used(tmp_path, head):
     table = files.read(put(tmp_path, head + "\n" + lines(TIME, ANGLE, ANGLE)))
     assert [column.name for column in table.columns] == ["", "", ""]

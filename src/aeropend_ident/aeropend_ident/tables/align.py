@@ -29,8 +29,8 @@ def align(table: Table) -> Table:
     tried = [_named(table, names) for names in _alignments(head, width)]
     odds = [log_odds(one) - WEAK * (0 < k < len(tried) - 1) for k, one in enumerate(tried)]
     likely = [one for one, at in zip(tried, odds) if at > max(odds) - SURE]
-    names = [each.pop() if len(each := {one.columns[k].name for one in likely}) == 1 else "" for k in range(width)
-             ] if likely else [""] * width
+    named = [{one.columns[k].name for one in likely} for k in range(width)]
+    names = [each.pop() if len(each) == 1 else "" for each in named]
     unnamed = [k + 1 for k, name in enumerate(names) if not name]
     note = f"{counted(len(head), 'name')} ({', '.join(head)}) for {counted(width, 'column')}: "
     if len(unnamed) == width:

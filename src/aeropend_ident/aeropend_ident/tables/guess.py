@@ -286,7 +286,8 @@ def _arm(table: Table, seen: list[Seen], found: list[Guess], clock: int | None, 
             angle[k] += FOLLOWS
     prior = COMMANDED - math.log(max(len(free) - 1, 1))
     tracked = {(k, j) for k, j in gains
-               if named[j][1] <= 0.0 and tracks(table.columns[k].values, table.columns[j].values)}
+               if named[j][1] <= 0.0
+               and tracks(table.columns[k].values, table.columns[j].values, seen[k].traits.block)}
     both: dict[tuple[int, int | None], float] = {}
     for k in free:
         moved = any(gains[k, j] >= SOME and j not in follows and (k, j) not in tracked

@@ -242,12 +242,17 @@ def _smoothed(x: Floats, y: Floats) -> float:
     return 1.0 - _left([terms[:, :2]], x[1:]) / (float(np.var(np.diff(x, 2))) or 1.0)
 
 
-def tracks(y: Floats, r: Floats) -> bool:
+def tracks(y: Floats, r: Floats, block: int) -> bool:
     """Whether y (N,) is led to r: it has its level and size, at the ends of the holds if r jumps and holds.
 
     A loop with an integral term may be far behind its reference, but its static gain is 1.
+
+    Args:
+        y: (N,) numbers, NaN if missing.
+        r: likewise.
+        block: of the traits of y.
     """
-    if _is_led(y, r):
+    if _is_led(y, r, block):
         return True
     ends = np.flatnonzero(np.diff(r) != 0.0)
     if 3 <= len(ends) <= (1.0 - HELD) * len(r):
@@ -261,9 +266,8 @@ def tracks(y: Floats, r: Floats) -> bool:
                 and np.corrcoef(y, r)[0, 1] >= 0.6)
 
 
-def _is_led(y: Floats, r: Floats) -> bool:
+def _is_led(y: Floats, r: Floats, block: int) -> bool:
     """Whether the static gain from r to y is 1 and the offset 0, by a linear model of order `LAGS`."""
-    block = traits(y).block
     a, b = blocks(np.nan_to_num(y), block), blocks(np.nan_to_num(r), block)
     size = float(np.std(b))
     if len(a) < 6 * LAGS or size == 0.0:

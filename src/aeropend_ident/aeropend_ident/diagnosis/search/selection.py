@@ -209,9 +209,8 @@ class SelectionRound:
         """Log evidence of each over no further effect, and probabilities; the best first."""
         gains = [x + h.log_odds for (h, _), x in zip(tried, self._gains(tried, Fit.log_evidence), strict=True)]
         first = self._close_most(tried)
-        frugal = self._frugal(tried, gains)
-        needless = {h.name for (h, _), g, f in zip(tried, gains, frugal, strict=True) if f < g}
-        gains = frugal
+        by_evidence, gains = gains, self._frugal(tried, gains)
+        needless = {h.name for (h, _), g, now in zip(tried, by_evidence, gains, strict=True) if now < g}
         weights = np.where([*first, True], [*gains, 0.0], -np.inf)
         weights = np.exp(weights - weights.max())
         probability = weights / weights.sum()
