@@ -11,7 +11,7 @@ from aeropend_ident.tables.guess import Given, guess, options
 from aeropend_ident.tables.names import meaning
 from aeropend_ident.tables.sparkline import sparkline
 from aeropend_ident.tables.table import Column, Table
-from aeropend_ident.tables.traits import traits
+from aeropend_ident.tables.traits import _origin, traits
 from aeropend_ident.tables.units import split_name
 
 RNG = np.random.default_rng(5)
@@ -87,6 +87,7 @@ def test_names_of_many_habits_in_a_loop(t, y, u, r, e):
     ({"t": LONG, "angle": DRIVEN, "u": PUSH - 10.0}, "duty", "it goes both ways, -10 to 70"),
     ({"t": LONG, "angle": DRIVEN, "u": np.rint(1054.0 + 8.0 * PUSH)}, "duty", "as pulses in µs?"),
     ({"time": np.arange(len(LONG)), "angle": DRIVEN, "u [%]": PUSH}, "time", "a counter of rows, or ms?"),
+    ({"t": LONG, "angle [deg]": DRIVEN, "pwr": np.rint(PUSH * 100.0 / PUSH.max())}, "duty", "%, or counts of 255?"),
 ])  # fmt: skip
 def test_what_is_in_doubt_is_not_sure(columns, quantity, why):
     guesses, sure = found(**columns)
@@ -120,6 +121,19 @@ def test_a_motor_that_follows_its_command_is_not_the_command():
     noisy = np.array(speed) + 0.01 * RNG.standard_normal(len(LONG))
     _, sure = found(x1=LONG, x2=DRIVEN, x3=noisy, x4=PUSH / 100.0)
     assert sure["duty"] == "x4:1"
+
+
+def test_a_name_of_a_motor_speed_says_nothing_where_no_propeller_turns_so_slowly():
+    _, sure = found(zaman=LONG, angle=DRIVEN, giri=PUSH / 100.0)  # giriş, an input, without its last letter
+    assert sure["duty"] == "giri:1"
+    _, sure = found(zaman=LONG, angle=DRIVEN, giri=30.0 * PUSH)
+    assert "duty" not in sure
+
+
+def test_a_command_in_phase_with_a_sine_is_no_second_derivative_of_it():
+    sine = 40.0 + 12.0 * np.sin(2.0 * np.pi * 0.4 * LONG)
+    assert _origin(traits(60.0 + 1.5 * sine + 3.0 * np.sin(2.0 * np.pi * 2.0 * LONG)), traits(sine))[1] != "derivative"
+    assert _origin(traits(np.gradient(sine, LONG)), traits(sine))[1] == "derivative"
 
 
 def test_a_smoothed_angle_is_not_the_angle():

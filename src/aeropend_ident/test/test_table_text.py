@@ -8,6 +8,7 @@ import pytest
 from arm_tables import ANGLE, DRIVEN, LONG, MAPPED, NUMBERS, PUSH, TIME, comma, imported, lines, put, refused
 
 from aeropend_ident.tables import files
+from aeropend_ident.tables.guess import guess
 from aeropend_ident.tables.units import parse
 
 DIALECTS = {
@@ -70,6 +71,14 @@ def test_a_column_stays_without_a_name_where_two_are_as_likely(tmp_path):
     table = files.read(put(tmp_path, head + "\n" + lines(LONG, DRIVEN, PUSH, 21.0 + 0.01 * LONG, split=";")))
     assert [column.name for column in table.columns] == ["t", "angle", "duty", ""]
     assert "but for column 4" in "".join(table.notes)
+
+
+def test_a_name_that_may_belong_to_either_of_two_columns_decides_for_none(tmp_path):
+    other = np.rint(20.0 + 30.0 * np.sin(1.7 * LONG))
+    text = "t;duty;angle\n" + lines(LONG, PUSH, other, DRIVEN, split=";")
+    table = files.read(put(tmp_path, text))
+    assert [column.name for column in table.columns] == ["t", "duty", "angle?", "angle?"]
+    assert "too" in "".join(one.why for one in guess(table) if one.quantity == "theta" and not one.sure)
 
 
 def test_a_decimal_comma_is_seen_wherever_it_shows(tmp_path):

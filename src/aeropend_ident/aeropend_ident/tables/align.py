@@ -3,7 +3,8 @@
 
 The order of the names is kept. Each column that may have no name, or each name that may have no column, is tried. The
 log odds of time, angle and command say how likely an alignment is; a gap at either end is likelier than one between.
-A column has a name if all likely alignments agree on it.
+A column has a name if all likely alignments agree on it. If some give it a name and the others none, the name has a
+question mark, so that no other column is taken for what the name says.
 """
 
 from __future__ import annotations
@@ -15,6 +16,9 @@ from aeropend_ident.tables.names import WEAK
 from aeropend_ident.tables.table import Table
 from aeropend_ident.tables.units import split_name
 from aeropend_sim.wording import counted
+
+UNSURE = "?"
+"""End of a name that may belong to the column."""
 
 
 def align(table: Table) -> Table:
@@ -30,15 +34,24 @@ def align(table: Table) -> Table:
     odds = [log_odds(one) - WEAK * (0 < k < len(tried) - 1) for k, one in enumerate(tried)]
     likely = [one for one, at in zip(tried, odds) if at > max(odds) - SURE]
     named = [{one.columns[k].name for one in likely} for k in range(width)]
-    names = [each.pop() if len(each) == 1 else "" for each in named]
-    unnamed = [k + 1 for k, name in enumerate(names) if not name]
+    names = [_of(each) for each in named]
+    unnamed = [k + 1 for k, name in enumerate(names) if not name or name.endswith(UNSURE)]
     note = f"{counted(len(head), 'name')} ({', '.join(head)}) for {counted(width, 'column')}: "
     if len(unnamed) == width:
+        names = [""] * width
         note += "which belongs to which is not clear, so that columns have numbers only"
     else:
         note += "the numbers tell which belongs to which" + (
             f", but for column{'s' * (len(unnamed) > 1)} {', '.join(map(str, unnamed))}" if unnamed else "")
     return replace(_named(table, names), head=(), notes=(*table.notes, note))
+
+
+def _of(names: set[str]) -> str:
+    """The name of a column that has any of some names; "" stands for none."""
+    if len(names) == 1:
+        return min(names)
+    given = names - {""}
+    return min(given) + UNSURE if len(given) == 1 else ""
 
 
 def _alignments(head: tuple[str, ...], width: int) -> list[list[str]]:

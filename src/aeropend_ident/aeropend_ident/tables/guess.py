@@ -328,7 +328,7 @@ def _arm(table: Table, seen: list[Seen], found: list[Guess], clock: int | None, 
         if rival is None:
             _constant_command(seen, found)
         else:
-            unit, scale, _ = _command_scale(seen[rival], given)
+            unit, scale, _ = _command_scale(seen[rival], seen[a], given)
             found[rival] = Guess("duty", unit, f"perhaps; {scale}", False)
         return both[a, b]
     if named[b][1] >= WEAK:  # its owner calls it a command, and others something else
@@ -337,7 +337,7 @@ def _arm(table: Table, seen: list[Seen], found: list[Guess], clock: int | None, 
         second = second or f"but column {table.label(a)} does not follow it"
     rival = _rival(both[a, b] - SURE, others, none=-1)
     doubt = second or ("" if rival is None else "or no command?" if rival < 0 else f"or column {table.label(rival)}?")
-    unit, scale, clear = _command_scale(seen[b], given)
+    unit, scale, clear = _command_scale(seen[b], seen[a], given)
     how = "" if gains[a, b] < SOME else f"column {table.label(a)} follows it"
     volts = bool(_unit(seen[b].column, "voltage")) or seen[b].meaning == Meaning("voltage", STRONG)
     if volts and not given.supply and not doubt and np.nanmin(seen[b].column.values) >= 0.0:
@@ -412,7 +412,7 @@ def _is_voltage(one: Seen) -> bool:
     return one.meaning.quantity == "voltage" or bool(_unit(one.column, "voltage"))
 
 
-def _command_scale(one: Seen, given: Given) -> scales.Scale:
+def _command_scale(one: Seen, angle: Seen, given: Given) -> scales.Scale:
     x = one.column.values[np.isfinite(one.column.values)]
     low, top = float(x.min()), float(x.max())
     said = _unit(one.column, "duty")
@@ -423,7 +423,8 @@ def _command_scale(one: Seen, given: Given) -> scales.Scale:
         unit, why, sure = "", f"in {said}", 0.02 < UNITS["duty"][said] * top <= 1.005
         why += "" if sure else f", {low:.4g} to {top:.4g}?"
     else:
-        unit, why, sure = scales.of_command(np.abs(x) if low < 0.0 else x, list(one.words), counts=one.counts)
+        unit, why, sure = scales.of_command(np.abs(x) if low < 0.0 else x, list(one.words), counts=one.counts,
+                                           units=bool(angle.column.unit))
     if low < 0.0 and -low > 0.005 * top:
         why += f"; it goes both ways, {low:.4g} to {top:.4g}" + ": add --both-ways reverse, brake or clip" * (
             not given.both_ways)

@@ -105,13 +105,14 @@ def of_angle(values: Floats, *, counts: bool, named: bool) -> Scale:
         SMALLEST_RADIANS <= span <= LARGEST_RADIANS)
 
 
-def of_command(values: Floats, words: list[str], *, counts: bool) -> Scale:
+def of_command(values: Floats, words: list[str], *, counts: bool, units: bool = False) -> Scale:
     """Unit of a command.
 
     Args:
         values: (N,) numbers.
         words: of the name.
         counts: they are written as counts would be.
+        units: the file has the unit of the angle, so that it would have % too.
     """
     x = values[np.isfinite(values)]
     low, top = float(x.min()), float(x.max())
@@ -129,7 +130,7 @@ def of_command(values: Floats, words: list[str], *, counts: bool) -> Scale:
         return f"counts:{top:g}", (f"{text}: in which unit? counts:{top:g} makes the largest full duty, enough for a "
                                    "rig that is not calibrated"), False
     pwm = "pwm" in words  # what a microcontroller writes into its register
-    if counts and not ((top == 100.0 and not pwm) or set(words) & PERCENT):
+    if counts and not ((top == 100.0 and not pwm and not units) or set(words) & PERCENT):
         return "counts:255" if pwm else "%", f"whole numbers up to {top:g}: %, or counts of 255?", False
     return "%", f"up to {top:.4g}", True
 

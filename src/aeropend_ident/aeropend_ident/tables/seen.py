@@ -13,6 +13,10 @@ from aeropend_ident.tables.traits import Traits, traits
 from aeropend_ident.tables.units import known, split_name
 
 
+LEAST_SPEED = 20.0
+"""Least maximum of a motor speed, in rad/s or rpm (choice: at 20 rad/s a propeller lifts 1/100 of what it lifts at 200)."""
+
+
 @dataclass(frozen=True, eq=False)
 class Seen:
     """All that is known about a column."""
@@ -31,7 +35,10 @@ def look_at(table: Table) -> list[Seen]:
     for k, column in enumerate(table.columns):
         x = column.values[np.isfinite(column.values)]
         decimals = table.lengths is not None and any("." in cell or "," in cell for cell in column.shown)
-        out.append(Seen(column, _meaning(table, k), traits(column.values), tuple(whole_words(column.name)),
+        meant = _meaning(table, k)
+        if meant.quantity == "omega" and not column.unit and len(x) and np.abs(x).max() < LEAST_SPEED:
+            meant = Meaning()  # giriş, an input, may have lost its last letter: giri is the speed of a motor
+        out.append(Seen(column, meant, traits(column.values), tuple(whole_words(column.name)),
                         not decimals and bool((x == np.rint(x)).all())))
     return out
 

@@ -226,7 +226,8 @@ def _origin(x: Traits, y: Traits) -> tuple[float, str]:
             return (copied, "late") if late > 0.0 else (0.0, "")
         noisier = np.std(np.diff(x.x, 2)) > np.std(np.diff(y.x, 2))
         return (copied, "noisy") if noisier else (0.0, "")
-    derived = max(1.0 - _left([column[:, None]], inner) / total for column in (rate, turn))
+    derived = max(1.0 - _left([column[:, None]], inner) / total if float(inner @ column) > 0.0 else 0.0
+                  for column in (rate, turn))  # minus the second derivative of a sine is a copy of it
     return (derived, "derivative") if derived >= DERIVED else (0.0, "")
 
 
