@@ -136,6 +136,14 @@ def test_a_command_in_phase_with_a_sine_is_no_second_derivative_of_it():
     assert _origin(traits(np.gradient(sine, LONG)), traits(sine))[1] == "derivative"
 
 
+def test_a_command_is_no_copy_of_the_motor_that_follows_it():
+    speed = np.convolve(DRIVEN, np.exp(-0.2 * np.arange(30)) * 0.18)[: len(LONG)]
+    guesses, sure = found(**{"Tiempo [s]": LONG, "pitch [deg]": driven(DRIVEN), "E_PITCH": DRIVEN / 10.0,
+                             "motor [rpm]": 90.0 * speed})
+    assert sure["omega"] == "motor [rpm]"
+    assert "copy" not in guesses["E_PITCH"].why
+
+
 def test_a_smoothed_angle_is_not_the_angle():
     smoothed, y = [], NOISY[0]
     for x in NOISY:

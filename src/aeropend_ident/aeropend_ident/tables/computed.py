@@ -7,12 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from aeropend_ident.tables.names import STRONG
 from aeropend_ident.tables.seen import Seen, says
 from aeropend_ident.tables.table import Floats, Table
 from aeropend_ident.tables.traits import Origin, differences, is_error, origins
+from aeropend_ident.tables.units import known
 
 FOLLOWS = -4.0
 """[nats] Log odds of a column that is computed from another one (choice: 50 to 1)."""
+
+OF_THE_MOTOR = ("omega", "current")
+"""Quantities that are measured, although they may be late copies of the command."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +67,8 @@ def explain(table: Table, seen: list[Seen], numbers: dict[int, Floats]) -> Expla
     said = {"same": "the same as", "filtered": "a filtered copy of", "late": "a late copy of",
             "noisy": "a noisy copy of", "derivative": "a derivative of"}
     for k, origin in _ordered(seen, origins([one.traits for one in seen], rest)).items():
+        if seen[k].meaning.quantity in OF_THE_MOTOR and seen[k].meaning.odds >= STRONG:
+            continue  # the motor follows the command
         commanded = [seen[j].meaning.quantity in ("duty", "voltage") for j in (k, origin.of)]
         if origin.how in said and commanded != [True, False]:  # a controller makes its command of the angle
             why[k] = f"{said[origin.how]} column {table.label(origin.of)}"
@@ -94,4 +101,7 @@ def _ordered(seen: list[Seen], found: dict[int, Origin]) -> dict[int, Origin]:
 
 
 def _clarity(one: Seen) -> float:
-    return one.meaning.odds * (one.meaning.quantity in ("theta", "duty")) + bool(one.column.unit)
+    """How clearly name and unit say that a column is the angle or the command."""
+    unit = one.column.unit
+    of_arm = bool(unit) and bool(known("theta", unit) or known("duty", unit))
+    return one.meaning.odds * (one.meaning.quantity in ("theta", "duty")) + of_arm
