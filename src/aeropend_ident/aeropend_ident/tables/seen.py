@@ -12,9 +12,8 @@ from aeropend_ident.tables.table import Column, Table
 from aeropend_ident.tables.traits import Traits, traits
 from aeropend_ident.tables.units import known, split_name
 
-
 LEAST_SPEED = 20.0
-"""Least maximum of a motor speed, in rad/s or rpm (choice: at 20 rad/s a propeller lifts 1/100 of what it lifts at 200)."""
+"""Least maximum of a motor speed, in rad/s or rpm (choice: at 20 rad/s a propeller lifts 1 % of that at 200)."""
 
 
 @dataclass(frozen=True, eq=False)
