@@ -3,11 +3,14 @@
 
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis import diagnosis
+from aeropend_ident.diagnosis.diagnosis import Settings, diagnose
+from aeropend_ident.diagnosis.gap_share import Part
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.diagnosis.results import document, verdict_lines
 from aeropend_ident.diagnosis.validation import validate
@@ -177,6 +180,23 @@ def filtered(factor):
 def test_two_effects_in_one_place_are_both_found():
     body = diagnose(BENCH, [recorded(72, {"coulomb_friction": {}, "thrust_lag": {}})], 2).body
     assert set(body["which"]["effects"]) == {"coulomb_friction", "thrust_lag"}
+
+
+def test_the_most_harmful_effect_is_taken_out_alone_unless_the_gap_is_then_larger(monkeypatch):
+    amounts = {frozenset("abc"): {"a": -3.0, "b": -1.0, "c": 2.0}, frozenset("bc"): {"b": 4.0, "c": -0.5}}
+    totals = {frozenset("abc"): 5.0, frozenset("bc"): 4.0, frozenset("b"): 6.0}
+
+    def measured(_fitted, found, _progress):
+        return found, None, SimpleNamespace(after=SimpleNamespace(total=totals[found]))
+
+    monkeypatch.setattr(diagnosis, "_parts", lambda found, *_: [
+        Part(name, "arm", amount, np.zeros(1)) for name, amount in amounts[found].items()])
+    monkeypatch.setattr(diagnosis, "_without", lambda found, name: found - {name})
+    monkeypatch.setattr(diagnosis, "_fit_and_measure", measured)
+    start = frozenset("abc")
+    found, _, _, parts = diagnosis._without_harmful(None, start, None, measured(None, start, None)[2], Settings(), None)
+    assert found == {"b", "c"}
+    assert [p.amount for p in parts] == [4.0, -0.5]
 
 
 def test_effects_all_over_the_chain_are_found_and_nothing_else():

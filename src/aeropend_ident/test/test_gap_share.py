@@ -39,13 +39,12 @@ def test_an_uncertain_size_and_a_gap_that_varies_widen_the_interval():
 
 def test_effects_that_stand_in_for_each_other_have_parts_that_add_up_to_what_they_close_together():
     alike = [part("quadratic_drag", 0.5), part("coulomb_friction", 1.5), part("gust", -0.1)]
-    together = part("quadratic_drag", 4.0)
-    assert [p.amount for p in gap_share._adding_up(alike, together)] == pytest.approx([1.0, 3.0, -0.2])
-    assert [p.windows[0] for p in gap_share._adding_up(alike, together)] == pytest.approx([1.0, 3.0, -0.2])
-    less = gap_share._adding_up(alike, part("quadratic_drag", 1.0))
-    assert [p.amount for p in less] == [p.amount for p in alike]
+    assert [p.amount for p in gap_share._adding_up(alike, 4.0)] == pytest.approx([1.0, 3.0, -0.1])
+    assert [p.windows[0] for p in gap_share._adding_up(alike, 4.0)] == pytest.approx([1.0, 3.0, -0.1])
+    assert [p.amount for p in gap_share._adding_up(alike, 1.0)] == pytest.approx([0.25, 0.75, -0.1])
+    assert [p.amount for p in gap_share._adding_up(alike, -1.0)] == [p.amount for p in alike]
     alone = part("gust", -0.1)
-    assert [p.amount for p in gap_share._adding_up([alone], alone)] == [-0.1]
+    assert [p.amount for p in gap_share._adding_up([alone], -0.1)] == [-0.1]
 
 
 def test_false_captures_do_not_count_in_the_shares_of_others():

@@ -232,7 +232,7 @@ def names(first: RankedHypothesis, second: RankedHypothesis) -> tuple[str, str]:
 
 
 def next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[RankedHypothesis, RankedHypothesis]],
-                    values: Mapping[str, float], tried: Sequence[Excitation]) -> NextExperiment | None:
+                    values: Mapping[str, float], tried: Sequence[Excitation], jobs: int = 1) -> NextExperiment | None:
     """The experiment that would separate the closest pair; None where nothing is open.
 
     Args:
@@ -241,6 +241,7 @@ def next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[Ranked
         pairs: see `not_separable`.
         values: of the joint fit.
         tried: the signals that are tried.
+        jobs: threads.
     """
     if not pairs:
         return None
@@ -253,7 +254,7 @@ def next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[Ranked
     one, other = ({**values, **own, **r.fit.values} for r in (first, second))
     if any(key(n).recording for n in values):
         one, other = of_rig(one), of_rig(other)
-    return experiment_design.next_experiment(model, signals, one, other, names(first, second), tried)
+    return experiment_design.next_experiment(model, signals, one, other, names(first, second), tried, jobs)
 
 
 def _within_range(name: str, value: float, sd: float) -> Interval:

@@ -8,7 +8,7 @@ judge whether an effect is unknown -> fit all jointly -> measure the gap -> conc
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -214,10 +214,11 @@ class _Gaps:
         there, here = self.fitted, self.after
         return 1.0 - there.rms[channel] / there.spread[channel], 1.0 - here.rms[channel] / here.spread[channel]
 
-    def budget(self, *, gust: bool) -> GapBudget | None:
+    def budget(self, *, gust: bool, jobs: int) -> GapBudget | None:
         """What could be closed of the gap, measured where the arm moves."""
         moving = self.held_out.in_motion()
-        return budget(moving.gap(self.runs_before), moving.gap(self.runs_after), self.floors, self.repeats, gust=gust)
+        return budget(moving.gap(self.runs_before), moving.gap(self.runs_after), self.floors, self.repeats, gust=gust,
+                      jobs=jobs)
 
 
 def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diagnosis:
@@ -229,10 +230,7 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
         return _diagnose(_fitted_further(fitted), settings, progress)
     if found.unknown is not None and gaps.after.within(gaps.floors, CHANNELS_OF[found.unknown.stage]):
         found = replace(found, unknown=None)
-    parts = _parts(found, joint, gaps, settings.jobs)
-    if harmful := {p.name for p in parts if p.amount < 0.0}:
-        found, joint, gaps = _fit_and_measure(fitted, _without(found, harmful), progress)
-        parts = _parts(found, joint, gaps, settings.jobs)
+    found, joint, gaps, parts = _without_harmful(fitted, found, joint, gaps, settings, progress)
     if found.unknown is not None and not _repeats(parts, settings.material):
         found = replace(found, unknown=None)
         parts = _parts(found, joint, gaps, settings.jobs)
@@ -285,14 +283,30 @@ def _fit_and_measure(fitted: CutChains, found: _Findings, progress: Progress) ->
     return found, joint, _measure(fitted, found, joint)
 
 
-def _without(found: _Findings, names: Collection[str]) -> _Findings:
-    """The findings without some effects, those that make the gap larger on data that no fit has used.
+def _without_harmful(fitted: CutChains, found: _Findings, joint: JointFit, gaps: _Gaps, settings: Settings,
+                     progress: Progress) -> tuple[_Findings, JointFit, _Gaps, list[Part]]:
+    """Take out the effects that make the gap larger on data that no fit has used; also returns the parts of the gap.
 
-    What is left without them decides again whether it is random, or unknown.
+    One at a time, the most harmful first: of effects that stand in for each other, one may be needed.
     """
+    needed: set[str] = set()
+    parts = _parts(found, joint, gaps, settings.jobs)
+    while harmful := [p for p in parts if p.amount < 0.0 and p.name not in needed]:
+        name = min(harmful, key=lambda p: p.amount).name
+        without = _fit_and_measure(fitted, _without(found, name), progress)
+        if without[2].after.total > gaps.after.total:
+            needed.add(name)  # nominal numbers could take its part over only against what is known of them
+            continue
+        found, joint, gaps = without
+        parts = _parts(found, joint, gaps, settings.jobs)
+    return found, joint, gaps, parts
+
+
+def _without(found: _Findings, name: str) -> _Findings:
+    """The findings without an effect; what is left without it decides again whether it is random, or unknown."""
     stages = dict(found.stages)
     for stage, f in found.stages.items():
-        kept = tuple(s for s in f.found if s[0].hypothesis.name not in names)
+        kept = tuple(s for s in f.found if s[0].hypothesis.name != name)
         if len(kept) < len(f.found):
             final = refit(found.chains, stage, [s[0].hypothesis for s in kept], f.final.values)
             stages[stage] = replace(f, found=kept, final=final)
@@ -405,10 +419,11 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
                      for check in joint.checks.values() for channel in check.rms},
                     tuple(reasons), None if unknown is None else _curves(unknown.term),
                     tuple(conclude.names(a, b) for a, b in undecided),
-                    conclude.next_experiment(chains.model, found.recordings[0], undecided, joint.values, tried),
+                    conclude.next_experiment(chains.model, found.recordings[0], undecided, joint.values, tried,
+                                             settings.jobs),
                     tuple(head.small)),
         closure=Closure(gaps.before.total, gaps.after.total, gaps.before.total_floor(gaps.floors), closed, low, high,
-                        budget=gaps.budget(gust=found.statistical.gust is not None)),
+                        budget=gaps.budget(gust=found.statistical.gust is not None, jobs=settings.jobs)),
         identified=None if calibrated else conclude.identified_model(chains, joint, rows),
         since=None if chains.known is None else since.changes(
             chains.known, joint, found.statistical, head.claimed),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -86,7 +87,7 @@ def experiments_within(top: float) -> tuple[Excitation, ...]:
 
 
 def advise(model: Model, signals: Signals, first: Named, rivals: Sequence[Named],
-           experiments: Sequence[Excitation] = EXPERIMENTS) -> NextExperiment:
+           experiments: Sequence[Excitation] = EXPERIMENTS, jobs: int = 1) -> NextExperiment:
     """Choose the signal on which a hypothesis differs most from each of its rivals after a refit.
 
     Args:
@@ -95,8 +96,11 @@ def advise(model: Model, signals: Signals, first: Named, rivals: Sequence[Named]
         first: the hypothesis.
         rivals: at least one. An effect at its neutral size is no part of a hypothesis.
         experiments: the signals that are tried.
+        jobs: threads.
     """
-    tried = {e: distances(model, signals, first, rivals, e) for e in experiments}
+    with ThreadPoolExecutor(jobs) as pool:
+        found = pool.map(lambda e: distances(model, signals, first, rivals, e), experiments)
+        tried = dict(zip(experiments, found, strict=True))
     # a difference grows with the square root of the time
     grown = {e: [d * math.sqrt(LONGEST / e.duration) for d, _ in tried[e]] for e in experiments}
     helped = [k for k in range(len(rivals)) if max(grown[e][k] for e in experiments) > SEPARATE]
@@ -118,7 +122,8 @@ def advise(model: Model, signals: Signals, first: Named, rivals: Sequence[Named]
 
 
 def next_experiment(model: Model, signals: Signals, first: Mapping[str, float], second: Mapping[str, float],
-                    names: tuple[str, str], experiments: Sequence[Excitation] = EXPERIMENTS) -> NextExperiment:
+                    names: tuple[str, str], experiments: Sequence[Excitation] = EXPERIMENTS, jobs: int = 1
+                    ) -> NextExperiment:
     """As `advise`, for two hypotheses.
 
     Args:
@@ -128,8 +133,9 @@ def next_experiment(model: Model, signals: Signals, first: Mapping[str, float], 
         second: values of the other.
         names: of both.
         experiments: the signals that are tried.
+        jobs: threads.
     """
-    return advise(model, signals, (names[0], first), [(names[1], second)], experiments)
+    return advise(model, signals, (names[0], first), [(names[1], second)], experiments, jobs)
 
 
 def distances(model: Model, signals: Signals, first: Named, rivals: Sequence[Named], excitation: Excitation

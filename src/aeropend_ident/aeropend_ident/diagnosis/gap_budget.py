@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
@@ -25,12 +26,17 @@ class Repeats:
     def __init__(self, chains: CutChains, values: Mapping[str, float]) -> None:
         self.of_stage = cache(lambda stage: free_curves.repeatable(chains, stage, values))
 
-    def of_channel(self, channel: str) -> Repeatable:
-        """The same for the stage whose misfit a channel shows first."""
-        return self.of_stage(next(stage for stage in STAGES if channel in CHANNELS_OF[stage]))
+    def of_channels(self, channels: Collection[str], jobs: int) -> dict[str, Repeatable]:
+        """The same for the stage whose misfit each channel shows first; stages are judged in threads."""
+        stages = {c: next(stage for stage in STAGES if c in CHANNELS_OF[stage]) for c in channels}
+        each = sorted(set(stages.values()))
+        with ThreadPoolExecutor(jobs) as pool:
+            found = dict(zip(each, pool.map(self.of_stage, each), strict=True))
+        return {c: found[stage] for c, stage in stages.items()}
 
 
-def budget(before: Gap, after: Gap, floors: Mapping[str, float], repeats: Repeats, *, gust: bool) -> GapBudget | None:
+def budget(before: Gap, after: Gap, floors: Mapping[str, float], repeats: Repeats, *, gust: bool,
+           jobs: int = 1) -> GapBudget | None:
     """The parts of the squared gap above the floor; None where nothing is open.
 
     Args:
@@ -39,16 +45,18 @@ def budget(before: Gap, after: Gap, floors: Mapping[str, float], repeats: Repeat
         floors: channel -> floor.
         repeats: how much of the rest repeats.
         gust: whether `gust` was detected: the rest of the angle is then random.
+        jobs: threads.
     """
     bottom = before.total_floor(floors)
     if before.total <= (1.0 + NOTHING_OPEN) * bottom:
         return None
+    repeating = repeats.of_channels([c for c in after.rms if not (gust and c == "theta")], jobs)
     repeatable, rest = 0.0, 0.0
     places: dict[str, float] = {}
     for channel, rms in after.rms.items():
         amount = max(rms**2 - floors[channel] ** 2, 0.0) / after.spread[channel] ** 2 / len(after.rms)
-        one = None if gust and channel == "theta" else repeats.of_channel(channel)
-        if one is not None:
+        if channel in repeating:
+            one = repeating[channel]
             places[one.place] = places.get(one.place, 0.0) + one.share * amount
             repeatable += one.share * amount
         rest += amount

@@ -86,10 +86,11 @@ class Headline:
 
 
 def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[Part]:
-    """The part of each effect that was fitted: the others are fitted again without it.
+    """The part of each effect that was fitted.
 
-    Where effects of a stage stand in for each other, little comes back without one of them. Their parts are then made
-    larger in proportion, so that their sum is what comes back without all of them.
+    An effect that is taken out of all leaves a gap; one that alone is put in closes a gap. Where effects of a stage
+    stand in for each other, the first is too small and the second too large: the part is the mean of both (of two
+    effects their value of L. Shapley, 1953). Parts are scaled so that their sum is what comes back without all of them.
 
     Args:
         joint: the joint fit.
@@ -98,26 +99,42 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
     """
     after = held_out.gap_of(joint.values)
 
-    def part(effects: Sequence[Hypothesis]) -> Part:
-        size = effects[0].own[0].name
+    def gap(effects: Sequence[Hypothesis]) -> Gap:
+        return held_out.gap_of(joint.without(effects))
+
+    def part(effect: Hypothesis, with_: Gap, without: Gap) -> Part:
+        size = effect.own[0].name
         distance = abs(joint.values[size] - neutral(held_out.model, size))
-        return _coming_back(effects[0].name, effects[0].place, held_out.gap_of(joint.without(effects)), after,
+        return _coming_back(effect.name, effect.place, without, with_,
                             min(joint.sd[size] / max(distance, 1e-300), LARGEST_UNSURE))
 
     stages = [f.effects for f in joint.findings.values() if f.effects]
     with ThreadPoolExecutor(jobs) as pool:
-        each = [[pool.submit(part, [h]) for h in effects] for effects in stages]
-        every = [pool.submit(part, effects) if len(effects) > 1 else own[0]
-                 for effects, own in zip(stages, each, strict=True)]
-    return [p for own, together in zip(each, every, strict=True)
-            for p in _adding_up([work.result() for work in own], together.result())]
+        out = [[pool.submit(gap, [h]) for h in effects] for effects in stages]
+        none = [pool.submit(gap, effects) for effects in stages]
+        # of two effects, the other alone is what is left without the first
+        alone = [[pool.submit(gap, [g for g in effects if g is not h]) for h in effects] if len(effects) > 2 else
+                 list(reversed(without)) for effects, without in zip(stages, out, strict=True)]
+    parts: list[Part] = []
+    for effects, without, own, all_out in zip(stages, out, alone, none, strict=True):
+        if len(effects) == 1:
+            parts.append(part(effects[0], after, without[0].result()))
+            continue
+        each = [_mean(part(h, after, w.result()), part(h, o.result(), all_out.result()))
+                for h, w, o in zip(effects, without, own, strict=True)]
+        parts += _adding_up(each, all_out.result().total**2 - after.total**2)
+    return parts
 
 
-def _adding_up(parts: Sequence[Part], together: Part) -> list[Part]:
-    """The parts of effects of a stage, made larger if they stand in for each other."""
+def _mean(one: Part, other: Part) -> Part:
+    return replace(one, amount=0.5 * (one.amount + other.amount), windows=0.5 * (one.windows + other.windows))
+
+
+def _adding_up(parts: Sequence[Part], together: float) -> list[Part]:
+    """The parts of effects of a stage, scaled to what they close together; a negative one is no part of it."""
     total = sum(max(p.amount, 0.0) for p in parts)
-    factor = max(together.amount / total, 1.0) if total > 0.0 else 1.0
-    return [replace(p, amount=factor * p.amount, windows=factor * p.windows) for p in parts]
+    factor = together / total if total > 0.0 and together > 0.0 else 1.0
+    return [replace(p, amount=factor * p.amount, windows=factor * p.windows) if p.amount > 0.0 else p for p in parts]
 
 
 def part_of_several(effects: Sequence[Hypothesis], joint: JointFit, held_out: HeldOut, place: str) -> Part:
