@@ -10,9 +10,11 @@ import pytest
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.search.findings import RankedHypothesis, adopted
 from aeropend_ident.diagnosis.search.hypotheses import from_linear, linear_parameters
 from aeropend_ident.diagnosis.search.search import _with_better_rivals, refit, search, trifling_gap, unsearched
 from aeropend_ident.diagnosis.search.selection import squared_gap
+from aeropend_ident.estimation.map_fit import fit
 from aeropend_ident.signals.signals import from_arrays
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import rig
@@ -113,6 +115,37 @@ def test_a_second_parameter_is_found_wherever_it_is(id_, true):
 
 
 # --- two effects
+
+
+@pytest.mark.promise("Verdict", "Two effects of one stage are found, though neither explains much without the other")
+@pytest.mark.parametrize(("one", "other"), [
+    ({"encoder_eccentricity": {"amplitude": 0.06, "phase": -1.8}}, {"axial_inflow": {}}),
+    ({"cable_torque": {"k": 3.0, "theta0": -0.6}}, {"axial_inflow": {}}),
+    ({"cable_torque": {"k": 3.0, "theta0": -0.6}}, {"thrust_lag": {"tau": 0.08}}),
+    ({"angle_offset": {"bias": 0.06}}, {"thrust_lag": {"tau": 0.08}})])
+def test_two_effects_of_one_stage_are_found(one, other):
+    findings = search(CutChains(BENCH, [recording({**one, **other}, 9, 30.0)]), 2)["arm"]
+    assert {h.name for h in findings.effects} == {*one, *other}
+
+
+@pytest.mark.parametrize(("gains", "count"), [((-50.0, 20.0), 0), ((-50.0, 80.0), 2), ((50.0, -80.0), 1)])
+def test_an_effect_without_evidence_of_its_own_stays_only_if_the_next_ones_support_it(monkeypatch, gains, count):
+    chains = CutChains(BENCH, [recording({"coulomb_friction": {}, "cable_torque": {}}, 4, 20.0)])
+    names = ("coulomb_friction", "cable_torque")
+
+    def select(here, findings, candidates):
+        k = len(findings.found)
+        h = next((h for h in candidates if here.stage == "arm" and h.name == (*names, "")[k]), None)
+        if h is None:
+            return findings, None
+        final = fit(chains.residuals("arm"), adopted(here.known, h))
+        selection = (RankedHypothesis(h, final, gains[k], 1.0),)
+        return replace(findings, found=(*findings.found, selection), final=final), h
+
+    monkeypatch.setattr("aeropend_ident.diagnosis.search.search._select", select)
+    found = search(chains)["arm"]
+    assert [h.name for h in found.effects] == list(names[:count])
+    assert [r.hypothesis.name for r in found.rivals] == list(names[count:count + 1])
 
 
 def test_what_only_stood_in_for_an_effect_gives_way_to_it():

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis import free_run_gap
 from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains, difference
-from aeropend_ident.diagnosis.chain.priors import nominal_parameters, nominal_sd
+from aeropend_ident.diagnosis.chain.priors import TOLERANCE, nominal_parameters, nominal_sd
 from aeropend_ident.diagnosis.chain.values import neutral
 from aeropend_ident.diagnosis.policy import CERTAIN
 from aeropend_ident.diagnosis.search.findings import Findings, Selection
@@ -98,8 +98,8 @@ class JointFit:
     def without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         """The values that leave the smallest gap without some of the effects.
 
-        Calibrated parameters stay within their priors. What comes back is what no other parameter could take over. The
-        values are fitted once.
+        Calibrated parameters stay within their tolerances. What comes back is what no other parameter could take over.
+        The values are fitted once.
         """
         names = frozenset(h.name for h in effects)
         if names not in self._fitted_without:
@@ -109,7 +109,8 @@ class JointFit:
     def _fit_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         rest = {stage: replace(f, found=tuple(s for s in f.found if s[0].hypothesis not in effects))
                 for stage, f in self.findings.items()}
-        parameters = [replace(p, sd=FREER * p.sd) for p in _parameters(self.chains, rest).values()]
+        parameters = [replace(self._within_tolerance(p), sd=FREER * p.sd)
+                      for p in _parameters(self.chains, rest).values()]
         free_run = self.chains.joined(_free_run_residuals(self.chains))
         noise = {k: noise_over_spread(self.chains, k) for k, r in self.fit.residuals.items() if len(r)}
 
@@ -125,6 +126,14 @@ class JointFit:
 
         best = min((self.values, self.expected_without(effects)), key=gap)
         return fit(residuals, started(parameters, best), 1, AGAIN_STEPS, math.inf).values
+
+    def _within_tolerance(self, p: Parameter) -> Parameter:
+        """A calibrated parameter with its tolerance as its range, or up to its estimate."""
+        chains = self.chains
+        if p.name not in chains.model.model or not chains.policy.calibrated or chains.known is not None:
+            return p
+        reach, now = TOLERANCE * p.sd, self.values[p.name]
+        return replace(p, low=max(p.low, min(p.mean - reach, now)), high=min(p.high, max(p.mean + reach, now)))
 
     def expected_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         """The values without some of the effects if the readings were linear in all of them."""

@@ -23,6 +23,9 @@ NOMINAL_SD = 0.03
 
 Derived: that of a uniform distribution over ±5 %, 0.05/√3."""
 
+TOLERANCE = math.sqrt(3.0)
+"""Standard deviations of a calibrated parameter in its tolerance (derived: a uniform distribution)."""
+
 CHAIN_SD = 0.06
 """Relative standard deviation of the time constant of the angle's filter.
 

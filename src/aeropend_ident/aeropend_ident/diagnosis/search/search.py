@@ -14,7 +14,7 @@ from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import model_parameters, nominal_parameters
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, STAGES
 from aeropend_ident.diagnosis.policy import MATERIAL, MATERIAL_SHARE
-from aeropend_ident.diagnosis.search.findings import Findings, adopted, drop_unneeded
+from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis, adopted, drop_unneeded
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import (
     Hypothesis,
@@ -68,6 +68,12 @@ EVEN = 0.5
 """Probability of all hypotheses of a round together above which an effect is found.
 
 Derived: an effect is then more likely than none."""
+
+
+MOSTLY = 0.5
+"""Share of the gap of a stage above which an effect is kept for the next round, whatever its evidence alone.
+
+Derived: it closes more than it leaves."""
 
 
 def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], None] = lambda *_: None,
@@ -139,7 +145,7 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
     others = {b for h in candidates for b in acts_on[h.name] if b != stage}
     downstream = {b: fit(chains.residuals(b), nominal_parameters(chains, b), least_ess=chains.policy.least_ess)
                   for b in others}
-    known = nominal
+    known, supported, gained = nominal, findings, 0.0
     while len(findings.found) < MOST_EFFECTS:
         here = SelectionRound(chains, stage, acts_on, downstream, known, findings.final, trifle, pool, deadline)
         if chains.policy.driven and _explained(here):
@@ -150,7 +156,12 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
         findings, best = _select(here, findings, candidates)
         if best is None:
             break
-        known = adopted(known, best)
+        known, gained = adopted(known, best), gained + findings.found[-1][0].gain
+        if gained > 0.0:
+            supported, gained = findings, 0.0
+    if len(findings.found) > len(supported.found):
+        rivals = findings.found[len(supported.found)]
+        findings = replace(supported, rivals=rivals, cut_short=findings.cut_short)
     return _without_unneeded(chains, _with_better_rivals(chains, findings, nominal), nominal)
 
 
@@ -186,8 +197,13 @@ def _select(here: SelectionRound, findings: Findings, candidates: list[Hypothesi
     if not policy.driven and findings.found:  # a residual in a narrow band seems to hold many independent samples
         sure = [float(expit(log_evidence_over(here.current, r.fit) + r.hypothesis.log_odds)) for r in ranked]
         ranked = tuple(replace(r, probability=min(r.probability, p)) for r, p in zip(ranked, sure, strict=True))
-    if sum(r.probability for r in ranked) < EVEN or not matters:
+    if not matters:
         return replace(findings, rivals=ranked), None
+    if sum(r.probability for r in ranked) < EVEN:
+        if not policy.calibrated or here.closes(best.fit) < MOSTLY * here.left_open(here.current):
+            return replace(findings, rivals=ranked), None
+        ranked = here.ranked(tried, none=False)  # what a further effect would explain may speak against this one alone
+        best = ranked[0]
     # an effect that acts on later stages was fitted to them too: the final fit is of this stage alone
     final = best.fit if set(best.fit.residuals) == set(findings.base.residuals) else fit(
         chains.residuals(here.stage), started(adopted(here.known, best.hypothesis), best.fit.values))
@@ -208,32 +224,42 @@ def _with_better_rivals(chains: CutChains, findings: Findings, nominal: list[Par
     if len(findings.found) < 2:
         return findings
     for k in range(len(findings.found)):
-        selection = findings.found[k]
-        known = _beside(findings, nominal, selection[0].hypothesis)
-        taken = {h.name for h in findings.effects}
-        for rival in selection[1:CONTENDERS]:
-            if rival.gain <= 0.0 or rival.hypothesis.name in taken:
-                continue
-            begun = {**findings.final.values, **{p.name: rival.fit.values[p.name] for p in rival.hypothesis.own}}
-            f = fit(chains.residuals(findings.stage), started(adopted(known, rival.hypothesis), begun))
-            ess = largest_ess([findings.final, f])
-            odds = rival.hypothesis.log_odds - selection[0].hypothesis.log_odds
-            gain = f.log_evidence(ess) - findings.final.log_evidence(ess) + odds
-            if gain > 0.0 and not _needs_more(chains, findings, selection[0].hypothesis, rival.hypothesis, f):
-                sure = float(expit(gain))
-                others = [replace(r, probability=1.0 - sure if r is selection[0] else 0.0) for r in selection
-                          if r is not rival]
-                swapped = (replace(rival, fit=f, gain=rival.gain + gain, probability=sure), *others)
-                found = (*findings.found[:k], swapped, *findings.found[k + 1:])
-                findings = replace(findings, found=found, final=f)
+        for rival in _rivals(findings, k):
+            better = _swapped(chains, findings, nominal, k, rival)
+            if better is not None:
+                findings = better
                 break
     return findings
 
 
-def _needs_more(chains: CutChains, findings: Findings, found: Hypothesis, rival: Hypothesis, f: Fit) -> bool:
-    """Whether a rival has more parameters than the effect that was found, and leaves a gap alike."""
-    left, theirs = (squared_gap(chains, x, CHANNELS_OF[findings.stage]) for x in (findings.final, f))
-    return len(rival.own) > len(found.own) and mean_square(f, findings.stage) >= FORM_SHOWS and left <= ALIKE * theirs
+def _rivals(findings: Findings, k: int) -> list[RankedHypothesis]:
+    """The close rivals of an effect found: those with evidence, but all of an effect that alone had none."""
+    selection, taken = findings.found[k], {h.name for h in findings.effects}
+    return [r for r in selection[1:CONTENDERS]
+            if (r.gain > 0.0 or selection[0].gain <= 0.0) and r.hypothesis.name not in taken]
+
+
+def _swapped(chains: CutChains, findings: Findings, nominal: list[Parameter], k: int, rival: RankedHypothesis
+             ) -> Findings | None:
+    """The findings with a rival in place of an effect; None if they are not better."""
+    selection, new = findings.found[k], rival.hypothesis
+    old = selection[0].hypothesis
+    begun = {**findings.final.values, **{p.name: rival.fit.values[p.name] for p in new.own}}
+    f = fit(chains.residuals(findings.stage), started(adopted(_beside(findings, nominal, old), new), begun))
+    ess = largest_ess([findings.final, f])
+    gain = f.log_evidence(ess) - findings.final.log_evidence(ess) + new.log_odds - old.log_odds
+    if gain <= 0.0 or (len(new.own) > len(old.own) and _alike(chains, findings, f)):
+        return None
+    sure = float(expit(gain))
+    others = [replace(r, probability=1.0 - sure if r is selection[0] else 0.0) for r in selection if r is not rival]
+    swapped = (replace(rival, fit=f, gain=rival.gain + gain, probability=sure), *others)
+    return replace(findings, found=(*findings.found[:k], swapped, *findings.found[k + 1:]), final=f)
+
+
+def _alike(chains: CutChains, findings: Findings, f: Fit) -> bool:
+    """Whether a fit with more parameters neither explains all nor halves the squared gap that is left."""
+    return (mean_square(f, findings.stage) >= FORM_SHOWS
+            and squared_gap(chains, findings.final) <= ALIKE * squared_gap(chains, f))
 
 
 def _without_unneeded(chains: CutChains, findings: Findings, nominal: list[Parameter]) -> Findings:

@@ -205,18 +205,24 @@ class SelectionRound:
         return [(h, f) for h, f in tried if h.name != lead.name] + better(
             [(lead, ended)], [f for h, f in tried if h.name == lead.name] or [ended])
 
-    def ranked(self, tried: FittedHypotheses) -> Selection:
-        """Log evidence of each over no further effect, and probabilities; the best first."""
+    def ranked(self, tried: FittedHypotheses, *, none: bool = True) -> Selection:
+        """Log evidence of each over no further effect, and probabilities; the best first.
+
+        Args:
+            tried: all hypotheses with their fits.
+            none: whether no further effect is a hypothesis too.
+        """
         gains = [x + h.log_odds for (h, _), x in zip(tried, self._gains(tried, Fit.log_evidence), strict=True)]
         first = self._close_most(tried)
         by_evidence, gains = gains, self._frugal(tried, gains)
-        needless = {h.name for (h, _), g, now in zip(tried, by_evidence, gains, strict=True) if now < g}
-        weights = np.where([*first, True], [*gains, 0.0], -np.inf)
+        behind = {h.name for (h, _), g, now, closes in zip(tried, by_evidence, gains, first, strict=True)
+                  if now < g or not closes}
+        weights = np.where([*first, none], [*gains, 0.0], -np.inf)
         weights = np.exp(weights - weights.max())
         probability = weights / weights.sum()
         ranked = [RankedHypothesis(h, f, g, float(p)) for (h, f), g, p in zip(tried, gains, probability, strict=False)]
         order = sorted(range(len(tried)), key=lambda j: (not first[j], -gains[j]))
-        return tuple(self._ranked_by_place([ranked[j] for j in order], needless))
+        return tuple(self._ranked_by_place([ranked[j] for j in order], behind))
 
     def _close_most(self, tried: FittedHypotheses) -> list[bool]:
         """Whether no other hypothesis leaves a materially smaller gap in this stage: evidence decides only among these.
@@ -265,7 +271,7 @@ class SelectionRound:
         return [of(f, ess) - of(self.current, ess)
                 - sum(later[b] for b in self.acts_on[h.name] if b != self.stage) for h, f in tried]
 
-    def _ranked_by_place(self, ranked: list[RankedHypothesis], needless: Collection[str]) -> list[RankedHypothesis]:
+    def _ranked_by_place(self, ranked: list[RankedHypothesis], behind: Collection[str]) -> list[RankedHypothesis]:
         """Decide between close rivals at different places if none of them explains the whole misfit.
 
         The true effect then has another form than the catalogue's. Each rival is given free curves at its own place.
@@ -274,11 +280,11 @@ class SelectionRound:
 
         Args:
             ranked: the best first.
-            needless: names of those that an alike one with fewer parameters replaces; they are no rivals.
+            behind: names of those that are no rivals: they close less, or an alike one has fewer parameters.
         """
         best = mean_square(ranked[0].fit, self.stage)
         close = [r for r in ranked[:CONTENDERS] if r.gain > max(ranked[0].gain - CLOSE_GAIN, 0.0)
-                 and r.hypothesis.name not in needless and mean_square(r.fit, self.stage) < CLOSE * best]
+                 and r.hypothesis.name not in behind and mean_square(r.fit, self.stage) < CLOSE * best]
         if best < FORM_SHOWS or len({r.hypothesis.place for r in close}) < 2:
             return ranked
         left: list[tuple[float, float]] = []
