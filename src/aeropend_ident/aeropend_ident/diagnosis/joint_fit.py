@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
 from aeropend_ident.diagnosis.search.search import refit
 from aeropend_ident.diagnosis.search.selection import noise_over_spread
-from aeropend_ident.estimation.map_fit import Fit, fit
+from aeropend_ident.estimation.map_fit import Fit, Sensitivities, fit, sensitivities, within_bounds
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.statistics import Z95, rms
 from aeropend_sim.model.parameters import Model
@@ -40,13 +41,8 @@ WIDER = 1.2
 Measured: rigs simulated for the purpose (seeds 11 to 13 of `make blind`); intervals are judged on others."""
 
 
-AGAIN_STEPS = 4
-"""Steps of a fit without some of the effects (choice: it starts close to its end, and only its gap counts)."""
-
-FREER = 30.0
-"""Factor on the priors' standard deviations in a fit without some of the effects: only their ends count.
-
-Choice: the finite differences are still small."""
+AGAIN_STEPS = 8
+"""Steps of a fit without some of the effects, with the derivatives of the joint fit (choice: only its gap counts)."""
 
 OTHER_SIZES = (0.6, 0.8, 1.25, 1.6)
 """Factors on the size of an effect from which a recording alone is fitted too (choice: swings have local minima)."""
@@ -107,25 +103,34 @@ class JointFit:
         return self._fitted_without[names]
 
     def _fit_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
-        rest = {stage: replace(f, found=tuple(s for s in f.found if s[0].hypothesis not in effects))
-                for stage, f in self.findings.items()}
-        parameters = [replace(self._within_tolerance(p), sd=FREER * p.sd)
-                      for p in _parameters(self.chains, rest).values()]
-        free_run = self.chains.joined(_free_run_residuals(self.chains))
+        gone = {p.name for h in effects for p in h.own}
+        gone -= {p.name for f in self.findings.values() for h in f.effects if h not in effects for p in h.own}
+        kept = [j for j, p in enumerate(self._freed) if p.name not in gone]
+        parameters = [self._freed[j] for j in kept]
+
+        slopes = {channel: s.of(kept) for channel, s in self._slopes.items()}
+        return within_bounds(self._of_spread, started(parameters, self.expected_without(effects)), slopes, AGAIN_STEPS)
+
+    @cached_property
+    def _freed(self) -> list[Parameter]:
+        """The parameters within their tolerances."""
+        return [self._within_tolerance(p) for p in self.parameters.values()]
+
+    @cached_property
+    def _slopes(self) -> dict[str, Sensitivities]:
+        """The derivatives of `_of_spread` at the joint fit."""
+        return sensitivities(self._of_spread, started(self._freed, self.values))
+
+    def _of_spread(self, values: dict[str, float]) -> dict[str, Array]:
+        """Residuals in units of the channel's spread, each channel as if it had as many readings as the longest."""
         noise = {k: noise_over_spread(self.chains, k) for k, r in self.fit.residuals.items() if len(r)}
+        found = {k: np.asarray(r) for k, r in self._free_run(values).items() if k in noise}
+        longest = max((len(r) for r in found.values()), default=0)
+        return {k: math.sqrt(longest / len(r)) * noise[k] * r for k, r in found.items()}
 
-        def residuals(values: dict[str, float]) -> dict[str, Array]:
-            """Residuals in units of the channel's spread, each channel as if it had as many readings as the longest."""
-            found = {k: np.asarray(r) for k, r in free_run(values).items() if k in noise}
-            longest = max((len(r) for r in found.values()), default=0)
-            return {k: math.sqrt(longest / len(r)) * noise[k] * r for k, r in found.items()}
-
-        def gap(start: Mapping[str, float]) -> float:
-            begun = {p.name: p.begin for p in started(parameters, start)}
-            return sum(float(np.sum(r * r)) for r in residuals(begun).values())
-
-        best = min((self.values, self.expected_without(effects)), key=gap)
-        return fit(residuals, started(parameters, best), 1, AGAIN_STEPS, math.inf).values
+    @cached_property
+    def _free_run(self) -> Callable[[dict[str, float]], dict[str, Array]]:
+        return self.chains.joined(_free_run_residuals(self.chains))
 
     def _within_tolerance(self, p: Parameter) -> Parameter:
         """A calibrated parameter with its tolerance as its range, or up to its estimate."""

@@ -22,6 +22,7 @@ the weights are renewed, and solves for the bounds more exactly than is needed h
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -29,6 +30,7 @@ from functools import cache, cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct
+from scipy.optimize import lsq_linear
 
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.statistics import effective_sample_size
@@ -62,6 +64,15 @@ GOOD_STEP = 0.75
 
 NARROWEST = 8
 """Coefficients of the cosine transform in the narrowest band (choice: their mean square is then good to a half)."""
+
+DAMPINGS = (0.0, 1e-2, 1e-1, 1.0, 10.0)
+"""Dampings that are tried until a step of `within_bounds` succeeds (choice: the derivatives are approximate)."""
+
+RIDGE = 1e-12
+"""Relative ridge that keeps a matrix regular, and least room for a step (choice: far below any step that counts)."""
+
+NEGLIGIBLE = 3e-3
+"""Relative decrease of the sum of squares at which `within_bounds` ends (choice: a gap then changes by 0.2 %)."""
 
 ENOUGH, ENOUGH_OF_EXCESS = 1e-2, 1e-4
 """Decrease of the cost below which the search stops: absolute, and relative to the cost above that of noise.
@@ -183,6 +194,12 @@ class Sensitivities:
         own = step[self.by]
         size = max(float(own @ own), 1e-300)
         return Sensitivities(self.by, self.rows + np.outer(own / size, change - own @ self.rows))
+
+    def of(self, kept: Sequence[int]) -> Sensitivities:
+        """The derivatives for some of the parameters, which are numbered anew."""
+        place = {j: k for k, j in enumerate(kept)}
+        at = [k for k, j in enumerate(self.by) if int(j) in place]
+        return Sensitivities(np.array([place[int(self.by[k])] for k in at], np.intp), self.rows[at])
 
 
 class Search:
@@ -371,6 +388,52 @@ def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence
                                                                          strict=True)}
     log_prior = 0.5 * float(np.linalg.slogdet(search.prior)[1] - z @ search.prior @ z)
     return Fit(values, sd, search.current, search.scale, search.ess, log_prior, products, search.prior)
+
+
+def sensitivities(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter]
+                  ) -> dict[str, Sensitivities]:
+    """Channel -> derivatives of the residuals with respect to the parameters in standard units, where these start."""
+    return Search(residuals, parameters, math.inf).differences()
+
+
+def within_bounds(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter],
+                  slopes: Mapping[str, Sensitivities], steps: int) -> dict[str, float]:
+    """The values with the smallest sum of squares within the bounds, whatever the priors.
+
+    Gauss-Newton steps, each solved exactly for the bounds (P. Stark and R. Parker, Bounded-variable least squares, 1995)
+    from derivatives that are corrected by Broyden's formula.
+
+    Args:
+        residuals: values by name -> residuals; all count alike.
+        parameters: to be fitted, from their starts.
+        slopes: of `sensitivities`, at a point nearby.
+        steps: at most.
+    """
+    search = Search(residuals, parameters, math.inf)
+    search.slopes = dict(slopes)
+    for _ in range(steps):
+        r = search.stack(search.current)
+        cost = float(r @ r)
+        rows = search.stacked(search.weighted(search.slopes))
+        information, gradient = rows @ rows.T, rows @ r
+        ridge = RIDGE * np.trace(information) / len(information) * np.eye(len(information))
+        new = cost
+        for damping in DAMPINGS:
+            root = np.linalg.cholesky(information + damping * np.diag(np.diag(information)) + ridge)
+            room = (np.minimum(search.low - search.z, -RIDGE), np.maximum(search.high - search.z, RIDGE))
+            step = lsq_linear(root.T, -np.linalg.solve(root, gradient), room, method="bvls").x
+            z = np.clip(search.z + step, search.low, search.high)
+            trial = search.at(z)
+            r = search.stack(trial)
+            new = float(r @ r)
+            if new < cost:
+                search.slopes = {k: s.corrected(z - search.z, trial[k] - search.current[k])
+                                 for k, s in search.slopes.items()}
+                search.z, search.current = z, trial
+                break
+        if not new < (1.0 - NEGLIGIBLE) * cost:
+            break
+    return {p.name: p.value(x) for p, x in zip(parameters, search.z, strict=True)}
 
 
 def screen(residuals: Callable[[dict[str, float]], Residuals], base: Fit, known: Sequence[Parameter],
