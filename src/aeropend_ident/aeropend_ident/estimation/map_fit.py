@@ -400,8 +400,8 @@ def within_bounds(residuals: Callable[[dict[str, float]], Residuals], parameters
                   slopes: Mapping[str, Sensitivities], steps: int) -> dict[str, float]:
     """The values with the smallest sum of squares within the bounds, whatever the priors.
 
-    Gauss-Newton steps, each solved exactly for the bounds (P. Stark and R. Parker, Bounded-variable least squares, 1995)
-    from derivatives that are corrected by Broyden's formula.
+    Gauss-Newton steps, each solved exactly for the bounds (P. Stark, R. Parker: Bounded-variable least squares. 1995),
+    with derivatives that are corrected by Broyden's formula.
 
     Args:
         residuals: values by name -> residuals; all count alike.
