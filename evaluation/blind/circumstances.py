@@ -289,6 +289,12 @@ class Judged:
         return {score.key_of(e["effect"], e["parameters"]) for e in self.label["effects"]}
 
     @property
+    def material(self) -> set[str]:
+        """The keys of the effects in it that make `GHOST` of the gap or more."""
+        return {score.key_of(e["effect"], e["parameters"]) for e in self.label["effects"]
+                if self.label["shares"].get(e["effect"], 0.0) >= GHOST}
+
+    @property
     def first(self) -> bool:
         """Whether the verdict is the main effect, or none where there is none."""
         return self.answer.first == ("none" if self.main is None else
@@ -369,6 +375,8 @@ def figures(found: Sequence[Judged]) -> list[score.Figure]:
               [j.answer.first != "none" for j in rows["nothing missing"]], at_most=0.03),
         share("three effects: all named", [j.keys <= set(j.answer.found) for j in rows["three effects"]],
               at_least=0.85),
+        share("three effects: all named that make 3 % of the gap or more",
+              [j.material <= set(j.answer.found) for j in rows["three effects"]]),
         share("onset: right effect first", right(rows["onset"]), at_least=0.90),
         share("onset: begins or ends within 0.5 s", [j.timed for j in rows["onset"]], at_least=0.95),
         share("slow drift of a reading or a force: right place", [j.placed for j in rows["slow drift"]],

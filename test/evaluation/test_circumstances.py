@@ -112,6 +112,10 @@ def test_each_figure_of_the_circumstances_can_fail():
     three = "three effects: all named"
     assert values(judged("three effects", ["gust", "supply_sag"], {}, "gust", ["gust", "supply_sag"]))[three] == 1.0
     assert values(judged("three effects", ["gust", "supply_sag"], {}, "gust", ["gust"]))[three] == 0.0
+    material = "three effects: all named that make 3 % of the gap or more"
+    one_small = {"gust": 0.9, "supply_sag": 0.02}
+    for found, expected in (("gust", 1.0), ("supply_sag", 0.0)):
+        assert values(judged("three effects", ["gust", "supply_sag"], one_small, found, [found]))[material] == expected
     loop = "closed loop: right effect first"
     assert values(judged("closed loop", ["gust"], {}, "gust", ["gust"]))[loop] == 1.0
     assert values(judged("closed loop", ["gust"], {}, "none", []))[loop] == 0.0
