@@ -104,22 +104,29 @@ class JointFit:
 
     def _fit_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         gone = {p.name for h in effects for p in h.own}
-        gone -= {p.name for f in self.findings.values() for h in f.effects if h not in effects for p in h.own}
-        kept = [j for j, p in enumerate(self._freed) if p.name not in gone]
-        parameters = [self._freed[j] for j in kept]
-
+        kept = [j for j, p in enumerate(self._bounded) if p.name not in gone or p.name in self._nominal]
+        # a parameter that was far off has its tolerance like any other
+        parameters = [self._within_tolerance(p) if p.name in gone else p
+                      for p in (self._bounded[j] for j in kept)]
         slopes = {channel: s.of(kept) for channel, s in self._slopes.items()}
         return within_bounds(self._of_spread, started(parameters, self.expected_without(effects)), slopes, AGAIN_STEPS)
 
     @cached_property
-    def _freed(self) -> list[Parameter]:
-        """The parameters within their tolerances."""
-        return [self._within_tolerance(p) for p in self.parameters.values()]
+    def _nominal(self) -> dict[str, Parameter]:
+        """The parameters of the nominal model by name."""
+        return {p.name: p for stage in self.findings for p in nominal_parameters(self.chains, stage)}
+
+    @cached_property
+    def _bounded(self) -> list[Parameter]:
+        """All parameters, each within its range; calibrated ones within their tolerances, or up to the estimate."""
+        own = {p.name: p for f in self.findings.values() for h in f.effects for p in h.own}
+        return [replace(self._nominal[n], low=p.low, high=p.high) if n in own and n in self._nominal
+                else self._within_tolerance(p, self.values[n]) for n, p in self.parameters.items()]
 
     @cached_property
     def _slopes(self) -> dict[str, Sensitivities]:
         """The derivatives of `_of_spread` at the joint fit."""
-        return sensitivities(self._of_spread, started(self._freed, self.values))
+        return sensitivities(self._of_spread, started(self._bounded, self.values))
 
     def _of_spread(self, values: dict[str, float]) -> dict[str, Array]:
         """Residuals in units of the channel's spread, each channel as if it had as many readings as the longest."""
@@ -132,13 +139,13 @@ class JointFit:
     def _free_run(self) -> Callable[[dict[str, float]], dict[str, Array]]:
         return self.chains.joined(_free_run_residuals(self.chains))
 
-    def _within_tolerance(self, p: Parameter) -> Parameter:
-        """A calibrated parameter with its tolerance as its range, or up to its estimate."""
+    def _within_tolerance(self, p: Parameter, *also: float) -> Parameter:
+        """A calibrated parameter with its tolerance, and what it is also to hold, as its range."""
         chains = self.chains
         if p.name not in chains.model.model or not chains.policy.calibrated or chains.known is not None:
             return p
-        reach, now = TOLERANCE * p.sd, self.values[p.name]
-        return replace(p, low=max(p.low, min(p.mean - reach, now)), high=min(p.high, max(p.mean + reach, now)))
+        ends = (p.mean - TOLERANCE * p.sd, p.mean + TOLERANCE * p.sd, *also)
+        return replace(p, low=max(p.low, min(ends)), high=min(p.high, max(ends)))
 
     def expected_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         """The values without some of the effects if the readings were linear in all of them."""
