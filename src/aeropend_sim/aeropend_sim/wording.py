@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Words for messages."""
 
+from collections.abc import Sequence
+
 
 def counted(number: int, noun: str, plural: str = "") -> str:
     """A number with its noun: '1 row', '3 rows'.
@@ -24,3 +26,12 @@ def times(ratio: float) -> str:
         ratio: the number, 0 or more.
     """
     return f"{float(f'{ratio:.3g}'):g} times" if ratio < MANY else f"more than {MANY:g} times"
+
+
+def enumerated(words: Sequence[str]) -> str:
+    """Words as a list in a sentence: "a", "a and b", "a, b and c".
+
+    Args:
+        words: one or more.
+    """
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

@@ -34,6 +34,7 @@ from aeropend_ident.result_folder import atomic_folder, ensure_free
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model.parameters import Model, save
 from aeropend_sim.untrusted import printable
+from aeropend_sim.wording import enumerated
 
 FILES = ("diagnosis.json", "report.html", "augmented.yaml")
 """Names of the files that a diagnosis writes."""
@@ -136,7 +137,7 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
     else:
         left = {"part": f"; {_spaced(sentence.open_part(closure))} stays open",
                 "none": "; none of the gap closes on held-out data"}.get(sentence.closing(closure), "")
-        lines.append(f"verdict: {' and '.join(which.effects)} ({document.where.place}){left}")
+        lines.append(f"verdict: {enumerated(which.effects)} ({document.where.place}){left}")
     if which.verdict != CANNOT_TELL and (failed := sentence.failed(document)):
         lines.append(f"warning: {failed}")
     found = {c.effect: c for c in reversed(which.candidates)}
