@@ -4,8 +4,10 @@
 import numpy as np
 import pytest
 
+from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.results import document, verdict_lines
+from aeropend_ident.diagnosis.search.onset import SHORTEST, _located, with_window
 from aeropend_ident.testing.rigs import BENCH, changing, recorded
 
 
@@ -21,6 +23,16 @@ def test_when_an_effect_begins_or_ends(effect, since, until):
     assert none is None
     assert at.low <= at.value <= at.high
     assert abs(at.value - true) < 0.5
+
+
+@pytest.mark.parametrize("begins", [True, False])
+def test_an_instant_stays_away_from_the_ends_of_what_is_fitted(begins):
+    """Where each instant fits alike, the search goes to the end of its range."""
+    signals = recorded(31, {})
+    edge = round(SHORTEST / signals.period)
+    window = (edge + 1, len(signals)) if begins else (0, edge + 1)
+    found, _ = _located(with_window(CutChains(BENCH, [signals]), window).each[0], {})
+    assert found[not begins] == edge
 
 
 def test_an_effect_that_acts_all_the_time_has_no_instant():

@@ -247,6 +247,19 @@ def test_a_step_of_the_duty_into_lost_samples_lies_in_their_middle_and_is_said(l
     assert any("1 step of the duty fell between samples" in note for note in signals.notes)
 
 
+def test_a_current_of_which_unknown_steps_leave_hardly_anything_is_left_out_and_said():
+    rng = np.random.default_rng(4)
+    data = columns()
+    data["duty"] = np.repeat(rng.uniform(0.2, 0.8, len(data["duty"])), 25)[:len(data["duty"])]
+    lost = np.zeros(len(data["duty"]), dtype=bool)
+    lost[24::25] = True  # the last sample before each step
+    for name in data:
+        data[name] = np.where(lost, np.nan, data[name])
+    signals = from_arrays(data, SAMPLE_PERIOD, BENCH.sensing)
+    assert not signals.has("i_a")
+    assert any("hardly any reading of the current is left" in note for note in signals.notes)
+
+
 @pytest.mark.parametrize("ends", [(-math.pi, math.pi), (0.0, 2.0 * math.pi)])
 def test_turns_of_an_angle_that_is_read_within_one_are_joined(ends):
     t = np.arange(0.0, 10.0, 0.01)

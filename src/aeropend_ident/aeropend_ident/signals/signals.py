@@ -34,6 +34,9 @@ STILL = 0.01
 AS_MUCH = 0.3
 """Share of its range that the duty moves in a part of the recording in which a channel then should change (choice)."""
 
+LEAST_LEFT = 0.1
+"""Least share of the current's readings that must be left beside steps at unknown instants (choice: some seconds)."""
+
 FEWEST = 10
 """Readings below which a channel was not read (choice: fewer give neither a fit nor a gap)."""
 
@@ -232,7 +235,11 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
     if len(unsure):
         said.append(f"{counted(len(unsure), 'step')} of the duty fell between samples, into lost ones, at an instant "
                     "that nothing shows: current and speed are not compared just after")
-        columns["i_a"] = np.where(shaken, np.nan, columns["i_a"])
+        left = np.where(shaken, np.nan, columns["i_a"])
+        if np.isfinite(left).sum() < LEAST_LEFT * np.isfinite(columns["i_a"]).sum():
+            said.append("the duty steps so often that hardly any reading of the current is left: it is not compared")
+            left = np.full(n, np.nan)
+        columns["i_a"] = left
     if np.ptp(duty) < STILL and np.nanstd(columns["theta"]) < 2.0 * sigma["theta"]:
         raise RecordingError(f"{name}: nothing happens in it, duty and angle stay where they are, so no verdict is "
                              "possible; record while `excite` runs")

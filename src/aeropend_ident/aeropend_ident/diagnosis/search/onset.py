@@ -218,7 +218,8 @@ def _located(chain: CutChain, fits: Mapping[str, Fit]) -> tuple[Window, list[int
         return sum(0.5 * f.ess[channel] * float(np.mean(r * r)) / f.scale[channel] ** 2
                    for b, f in fits.items() for channel, r in moved.residuals(b)(f.values).items())
 
-    first, last = 1, len(chain.signals) - 1
+    edge = round(SHORTEST / chain.signals.period)
+    first, last = edge, max(chain.signals.train - edge, window[not begins])
     best, reach, costs = window[not begins], round(WIDE / chain.signals.period), dict[int, float]()
     while True:
         step = max(reach // PIECES, 1)
