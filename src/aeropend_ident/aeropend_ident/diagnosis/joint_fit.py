@@ -105,8 +105,8 @@ class JointFit:
     def _fit_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         gone = {p.name for h in effects for p in h.own}
         kept = [j for j, p in enumerate(self._bounded) if p.name not in gone or p.name in self._nominal]
-        # a parameter that was far off has its tolerance like any other
-        parameters = [self._within_tolerance(p) if p.name in gone else p
+        # a parameter that was far off has its range like any other
+        parameters = [self._within_tolerance(self._nominal[p.name]) if p.name in gone else p
                       for p in (self._bounded[j] for j in kept)]
         slopes = {channel: s.of(kept) for channel, s in self._slopes.items()}
         return within_bounds(self._of_spread, started(parameters, self.expected_without(effects)), slopes, AGAIN_STEPS)
