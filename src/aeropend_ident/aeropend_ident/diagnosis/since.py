@@ -160,7 +160,7 @@ def _perhaps_before(joint: JointFit, changed: Sequence[Change]) -> list[str]:
     if not appeared:
         return []
     without = joint.expected_without(appeared)
-    stand_ins = [c.name for c in changed if c.before is not None and c.claimed and
+    stand_ins = [c.name for c in changed if c.before is not None and
                  1.0 / ALIKE <= (without[c.name] - c.after.value) / (c.before.value - c.after.value) <= ALIKE]
     return [*(p.name for h in appeared for p in h.own), *stand_ins] if stand_ins else []
 

@@ -67,8 +67,9 @@ class Findings:
         return replace(self, found=tuple(s for s in self.found if s is not selection), final=final or self.final)
 
     def nothing(self) -> Findings:
-        """The findings with all effects taken back."""
-        return replace(self, found=(), rivals=(), final=self.base)
+        """The findings with all effects taken back; those of the first round stay as what was tried."""
+        tried = tuple(replace(r, probability=0.0) for r in (self.found[0] if self.found else self.rivals))
+        return replace(self, found=(), rivals=tried, final=self.base)
 
 
 def adopted(known: list[Parameter], hypothesis: Hypothesis, start: int = 0) -> list[Parameter]:
