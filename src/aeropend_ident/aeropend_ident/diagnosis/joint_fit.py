@@ -105,9 +105,7 @@ class JointFit:
     def _fit_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         gone = {p.name for h in effects for p in h.own}
         kept = [j for j, p in enumerate(self._bounded) if p.name not in gone or p.name in self._nominal]
-        # a parameter that was far off has its range like any other
-        parameters = [self._within_tolerance(self._nominal[p.name]) if p.name in gone else p
-                      for p in (self._bounded[j] for j in kept)]
+        parameters = [self._back(p) if p.name in gone else p for p in (self._bounded[j] for j in kept)]
         slopes = {channel: s.of(kept) for channel, s in self._slopes.items()}
         return within_bounds(self._of_spread, started(parameters, self.expected_without(effects)), slopes, AGAIN_STEPS)
 
@@ -116,12 +114,16 @@ class JointFit:
         """The parameters of the nominal model by name."""
         return {p.name: p for stage in self.findings for p in nominal_parameters(self.chains, stage)}
 
+    def _back(self, p: Parameter) -> Parameter:
+        """A parameter that was far off, with the range that it has like any other; its unit stays."""
+        own = self._within_tolerance(self._nominal[p.name])
+        return replace(p, low=own.low, high=own.high)
+
     @cached_property
     def _bounded(self) -> list[Parameter]:
         """All parameters, each within its range; calibrated ones within their tolerances, or up to the estimate."""
-        own = {p.name: p for f in self.findings.values() for h in f.effects for p in h.own}
-        return [replace(self._nominal[n], low=p.low, high=p.high) if n in own and n in self._nominal
-                else self._within_tolerance(p, self.values[n]) for n, p in self.parameters.items()]
+        own = {p.name for f in self.findings.values() for h in f.effects for p in h.own}
+        return [p if n in own else self._within_tolerance(p, self.values[n]) for n, p in self.parameters.items()]
 
     @cached_property
     def _slopes(self) -> dict[str, Sensitivities]:
