@@ -99,8 +99,15 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
     """
     after = held_out.gap_of(joint.values)
 
+    stages = [f.effects for f in joint.findings.values() if f.effects]
+    subsets = {_names(gone): gone for effects in stages for h in effects
+               for gone in ([h], _but(effects, h), effects) if gone}
+    with ThreadPoolExecutor(jobs) as pool:
+        found = pool.map(lambda gone: held_out.gap_of(joint.without(gone)), subsets.values())
+        gaps = {frozenset(): after, **dict(zip(subsets, found, strict=True))}
+
     def gap(effects: Sequence[Hypothesis]) -> Gap:
-        return held_out.gap_of(joint.without(effects))
+        return gaps[_names(effects)]
 
     def part(effect: Hypothesis, with_: Gap, without: Gap) -> Part:
         size = effect.own[0].name
@@ -108,22 +115,17 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
         return _coming_back(effect.name, effect.place, without, with_,
                             min(joint.sd[size] / max(distance, 1e-300), LARGEST_UNSURE))
 
-    stages = [f.effects for f in joint.findings.values() if f.effects]
-    with ThreadPoolExecutor(jobs) as pool:
-        out = [[pool.submit(gap, [h]) for h in effects] for effects in stages]
-        none = [pool.submit(gap, effects) for effects in stages]
-        # of two effects, the other alone is what is left without the first
-        alone = [[pool.submit(gap, [g for g in effects if g is not h]) for h in effects] if len(effects) > 2 else
-                 list(reversed(without)) for effects, without in zip(stages, out, strict=True)]
-    parts: list[Part] = []
-    for effects, without, own, all_out in zip(stages, out, alone, none, strict=True):
-        if len(effects) == 1:
-            parts.append(part(effects[0], after, without[0].result()))
-            continue
-        each = [_mean(part(h, after, w.result()), part(h, o.result(), all_out.result()))
-                for h, w, o in zip(effects, without, own, strict=True)]
-        parts += _adding_up(each, all_out.result().total**2 - after.total**2)
-    return parts
+    return [p for effects in stages for p in _adding_up(
+        [_mean(part(h, after, gap([h])), part(h, gap(_but(effects, h)), gap(effects))) for h in effects],
+        gap(effects).total**2 - after.total**2)]
+
+
+def _names(effects: Sequence[Hypothesis]) -> frozenset[str]:
+    return frozenset(h.name for h in effects)
+
+
+def _but(effects: Sequence[Hypothesis], one: Hypothesis) -> list[Hypothesis]:
+    return [h for h in effects if h is not one]
 
 
 def _mean(one: Part, other: Part) -> Part:

@@ -132,10 +132,14 @@ class JointFit:
 
     def _of_spread(self, values: dict[str, float]) -> dict[str, Array]:
         """Residuals in units of the channel's spread, each channel as if it had as many readings as the longest."""
-        noise = {k: noise_over_spread(self.chains, k) for k, r in self.fit.residuals.items() if len(r)}
-        found = {k: np.asarray(r) for k, r in self._free_run(values).items() if k in noise}
+        found = {k: np.asarray(r) for k, r in self._free_run(values).items() if k in self._noise}
         longest = max((len(r) for r in found.values()), default=0)
-        return {k: math.sqrt(longest / len(r)) * noise[k] * r for k, r in found.items()}
+        return {k: math.sqrt(longest / len(r)) * self._noise[k] * r for k, r in found.items()}
+
+    @cached_property
+    def _noise(self) -> dict[str, float]:
+        """Channel -> noise of a reading in units of the channel's spread, of those that were fitted."""
+        return {k: noise_over_spread(self.chains, k) for k, r in self.fit.residuals.items() if len(r)}
 
     @cached_property
     def _free_run(self) -> Callable[[dict[str, float]], dict[str, Array]]:
