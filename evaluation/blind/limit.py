@@ -193,7 +193,7 @@ class Readings:
     def of(self, model: Model) -> Array:
         """All channels as one vector (M,)."""
         run = dynamics.simulate(model, self.duty)
-        theta = sensing.angle_reading(run.theta, run.theta_dot, sensing.prepare(model))
+        theta = sensing.read_angle(model, run.theta, run.theta_dot)
         i_a = sensing.read_current(model, run.i_a)
         v_a = sensing.read_voltage(model, run.v_a)
         speed = mean_speed(run.rotor_angle, self.end, self.length, SAMPLE_PERIOD)

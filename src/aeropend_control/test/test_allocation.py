@@ -41,14 +41,14 @@ def test_what_the_limits_leave_is_told(thrust_time):
 def test_a_thrust_time_is_the_time_in_which_the_thrust_follows():
     observer = Observer(BENCH)
     allocation, model = Allocation(observer, 0.08), BENCH
-    c, e, x = dynamics.prepare(model)
+    prepared = dynamics.prepare(model)
     state = dynamics.steady(model, 0.4)
     start, out, thrust = state.thrust, np.empty((7, 1)), []
     for _ in range(300):
         duty, _ = allocation.duty(1.1 * start, state)
         thrust.append(state.thrust)
         v = float(actuator.voltage(model.numbers(), duty))
-        state = dynamics.run(np.array([v]), np.zeros(1), state, c, e, x, out)
+        state = dynamics.run(np.array([v]), np.zeros(1), state, *prepared, out)
     way = (np.array(thrust) - start) / (0.1 * start)
     assert np.argmax(way > 0.632) * observer.period == pytest.approx(0.08, rel=0.1)
     assert way[-1] == pytest.approx(1.0, abs=0.02)

@@ -7,6 +7,8 @@ conversion of a long number takes hours, and a tag that does not fit its value r
 
 from __future__ import annotations
 
+import re
+from collections.abc import Hashable
 from typing import Any
 
 import yaml
@@ -76,3 +78,26 @@ def load_yaml(text: str | bytes, loader: Any = _FASTEST) -> Any:
         raise
     except Exception as error:  # from int(), float() and datetime()
         raise yaml.YAMLError(f"a value does not fit its tag or type: {error}") from error
+
+
+class NumberLoader(yaml.SafeLoader):
+    """Reads numbers as rcl does (1e-5 is a number, which is text in YAML 1.1), and refuses repeated keys."""
+
+    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 - PyYAML's own
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, object]:
+        """A mapping, without repeated keys."""
+        seen: set[str] = set()
+        for key, _ in node.value:
+            name = str(key.value)
+            if name in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"{name} is given twice", key.start_mark)
+            seen.add(name)
+        return super().construct_mapping(node, deep)
+
+
+NumberLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$"),
+    list("-+.0123456789"))
+NumberLoader.add_implicit_resolver("tag:yaml.org,2002:null", re.compile(r"~$|null$|Null$|NULL$|$"), ["~", "n", "N", ""])

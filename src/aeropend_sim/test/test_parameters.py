@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aeropend_sim.model import effect_file
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import (
     MODEL_NAMES,
@@ -21,6 +22,7 @@ from aeropend_sim.model.parameters import (
     load,
     save,
     to_flat,
+    with_definitions,
 )
 
 BENCH = (files("aeropend_sim") / "config" / "bench.yaml").read_text(encoding="utf-8")
@@ -259,6 +261,18 @@ def test_rcl_reads_a_saved_file_to_the_last_bit(tmp_path):
     save(model, path, "all effects")
     assert numbers(load(path)) == numbers(model)
     assert read_with_rcl(path) == to_flat(model)
+
+
+def test_rcl_reads_the_definition_of_an_effect(tmp_path):
+    size = {"unit": "1/s²", "default": 1, "low": 0, "high": 9}
+    effect_file.define({"rcl_detent": {"place": "arm", "physics": "it's \"held\": -", "term": "- k * theta",
+                                       "parameters": {"k": size}}}, "a test")
+    path = tmp_path / "m.yaml"
+    save(load("bench").with_effects({"rcl_detent": {"k": 2.0}}), path)
+    found = read_with_rcl(path)
+    assert found["effects.rcl_detent.k"] == 2.0
+    assert with_definitions(found, "rcl") == to_flat(load(path))
+    assert found["definitions.rcl_detent.term"] == "- k * theta"
 
 
 def test_rcl_reads_a_preset_and_a_file_without_effects(tmp_path):

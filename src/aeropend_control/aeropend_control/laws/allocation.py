@@ -83,7 +83,7 @@ class Allocation:
 
     def thrust(self, speed: float) -> float:
         """[N] Thrust at a steady speed [rad/s]."""
-        c, e, _ = self._observer.plant
+        c, e, *_ = self._observer.plant
         return float(dynamics.static_thrust(speed, c, e))
 
     def speed(self, thrust: float) -> float:

@@ -15,6 +15,7 @@ from aeropend_sim.compiled import njit
 from aeropend_sim.model import actuator, dynamics, sensing
 from aeropend_sim.model.effects import Values
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+from aeropend_sim.model.terms import Terms
 
 Array = NDArray[np.float64]
 
@@ -105,10 +106,10 @@ class Observer:
         self.model, self.period, self.motor = model, period, motor
         self.numbers = model.numbers()
         steady = {"gust": {"sigma": 1e-9, "tau": 1e3}}  # no random torque, only a state for the estimate
-        c, e, x = dynamics.prepare(model.with_effects({**model.effects, **steady}), period)
+        c, e, x, added = dynamics.prepare(model.with_effects({**model.effects, **steady}), period)
         assert e is not None
         assert x is not None
-        self.plant = c, e, x
+        self.plant = c, e, x, added
         self._chain = sensing.prepare(model, period)
         self._gain = _kalman(self._chain, self.numbers["c_over_J"], period)
         n = self.numbers
@@ -188,23 +189,25 @@ class Observer:
 
 @njit(nogil=True)
 def _observe(theta: float, volts: Array, s: dynamics.State, m: sensing.Memory, gain: Array,
-             chain: sensing.MeasurementChain, c: dynamics.Coefficients, e: Values | None, x: dynamics.Extra | None
-             ) -> tuple[dynamics.State, sensing.Memory, tuple[dynamics.State, float, float, float]]:
+             chain: sensing.MeasurementChain, c: dynamics.Coefficients, e: Values | None, x: dynamics.Extra | None,
+             added: Terms | None) -> tuple[dynamics.State, sensing.Memory, tuple[dynamics.State, float, float, float]]:
     """Correct the state by a reading, advance it by the first voltage, and predict it over the other voltages."""
     if not math.isnan(theta):
         error = theta - m.stage2
         y, rate = s.theta + gain[0] * error, s.theta_dot + gain[1] * error
         s = dynamics.State(s.i_a, s.omega, s.rotor_angle, y, rate, s.thrust, s.heat, s.flex, s.flex_dot,
-                           s.gust + gain[2] * error)
+                           s.gust + gain[2] * error, s.time, s.memory)
         m = sensing.Memory(m.stage1 + gain[3] * error, m.stage2 + gain[4] * error, y, rate, m.omega, m.rotor_angle,
                            m.last_pulse, m.speed, m.time)
     scratch, silent = np.empty((7, len(volts))), np.zeros(len(volts))
-    s = dynamics.run(volts[:1], silent, s, c, e, x, scratch)
+    s = dynamics.run(volts[:1], silent, s, c, e, x, added, scratch)
     stage1, stage2 = sensing.filter_angle(m, s.theta, s.theta_dot, chain)
     m = sensing.Memory(stage1, stage2, s.theta, s.theta_dot, m.omega, m.rotor_angle, m.last_pulse, m.speed, m.time)
-    p = dynamics.run(volts[1:], silent, s, c, e, x, scratch) if len(volts) > 1 else s
+    p = dynamics.run(volts[1:], silent, s, c, e, x, added, scratch) if len(volts) > 1 else s
     sine, motion = math.sin(p.theta), dynamics.Motion(p.theta, p.theta_dot, 0.0, 0.0)
     drive = dynamics.arm_drive(sine, motion, 0.0, p.omega, 0.0, c, e)
+    if added is not None:
+        drive += dynamics.arm_terms(motion, p.thrust, p.omega, dynamics.Past(p.time, p.memory), c, added)
     nominal = dynamics.arm_drive(sine, motion, 0.0, p.omega, 0.0, c, None)
     return s, m, (p, drive, nominal, dynamics.near_ground(p.theta, e))
 
@@ -245,7 +248,7 @@ def _correct_motor(omega: float, i_a: float, s: dynamics.State, m: MotorCorrecti
         share = -math.expm1(-time / SPEED_TIME)
         voltage = min(max(voltage + share * error / per_volt, -LARGEST_BIAS), LARGEST_BIAS)
         s = dynamics.State(s.i_a, max(s.omega + share * error, 0.0), s.rotor_angle, s.theta, s.theta_dot, s.thrust,
-                           s.heat, s.flex, s.flex_dot, s.gust)
+                           s.heat, s.flex, s.flex_dot, s.gust, s.time, s.memory)
     return s, MotorCorrection(voltage, current, read, at_pulse, outliers, k + 1)
 
 

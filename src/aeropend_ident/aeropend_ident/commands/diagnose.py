@@ -34,6 +34,7 @@ from aeropend_ident.signals.signals import Mounting
 from aeropend_sim.cli import browser
 from aeropend_sim.cli.command import Parser, between, entry_point, own
 from aeropend_sim.cli.progress import progress
+from aeropend_sim.model import effect_file
 from aeropend_sim.model.parameters import PRESETS, load
 from aeropend_sim.untrusted import printable
 
@@ -45,6 +46,7 @@ EXAMPLES = """examples:
   diagnose --each rigs/* --out verdicts          recordings of different rigs: a verdict each, and a table
   diagnose --each rigs/* --dask tcp://host:8786  the same on a Dask cluster (pip install 'aeropend_ident[dask]')
   diagnose let_go --uncalibrated                 a rig without a model file; a free decay needs no command
+  diagnose my_bag --effects my_effects.yaml      try effects by formula too (docs/guide/effects.md)
   diagnose my_bag --open                         show the report in the browser
   diagnose my_bag --out verdict --jobs 2         choose the folder and the number of threads
   plant --ros-args --params-file verdict/augmented.yaml      simulate the augmented model
@@ -89,6 +91,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--seconds", type=between(0.0, 1e6, "a time", " s"), metavar="S",
                         help="how long the search for effects may take (default: a number of simulations bounds it for "
                              "uncalibrated rigs); a note tells if more time could change the verdict")
+    parser.add_argument("--effects", action="append", default=[], metavar="FILE",
+                        help="effect file: effects by formula that are tried beside those of the catalogue; may be "
+                             "given several times")
     parser.add_argument("--overwrite", action="store_true", help="replace results in the folder")
     parser.add_argument("--open", action="store_true", help="show the report in the browser")
     options = parser.parse_args(arguments)
@@ -129,6 +134,15 @@ def identified_with(model: Path) -> Identified | None:
         return None
 
 
+def effects_of(files: Sequence[str]) -> tuple[str, ...]:
+    """Ids of the effects of effect files, which are then known to models.
+
+    Raises:
+        EffectError: a file cannot be read, or a definition in it cannot be used.
+    """
+    return tuple(id_ for file in files for id_ in effect_file.load(file))
+
+
 def run(options: argparse.Namespace, command: str) -> None:
     """Diagnose recordings of one rig together and write the results.
 
@@ -138,7 +152,7 @@ def run(options: argparse.Namespace, command: str) -> None:
     started = time.monotonic()
     out = Path(options.out or f"diagnosis_{folder_names(options.bags[:1], [batch.SUMMARY])[0]}")
     ensure_free(out, FILES, overwrite=options.overwrite)
-    known, uncalibrated = None, options.fit_nominal
+    known, uncalibrated, further = None, options.fit_nominal, effects_of(options.effects)
     if options.since:
         model, known, verdicts = since.read([Path(folder) for folder in options.since])
         of_rig = verdicts[-1].identified
@@ -156,7 +170,8 @@ def run(options: argparse.Namespace, command: str) -> None:
         if of_rig is not None:
             signals = [(of_rig.mounting or Mounting()).of(s) for s in signals]
         found = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal, material=options.material,
-                         seconds=options.seconds, known=known, progress=lambda what, share: show(share, what))
+                         seconds=options.seconds, known=known, further=further,
+                         progress=lambda what, share: show(share, what))
         alike = found.signals[0].mounting or Mounting()
         tests = [alike.of(s) for s in tests]
         shown = [Across(bag, **vars(validate(found.model, found.augmented, s))) for bag, s in zip(options.test, tests)]
@@ -182,8 +197,10 @@ def run_each(options: argparse.Namespace) -> None:
     ensure_free(out, (batch.SUMMARY,), overwrite=options.overwrite)
     for name in names:
         ensure_free(out / name, FILES, overwrite=options.overwrite)
-    settings = batch.Settings(load(options.model), options.model, options.namespace, options.held_out,
-                             options.fit_nominal, options.material, options.seconds)
+    further, model = effects_of(options.effects), load(options.model)
+    settings = batch.Settings(model, options.model, options.namespace, options.held_out, options.fit_nominal,
+                              options.material, options.seconds, further,
+                              effect_file.definitions([*further, *model.effects]))
     commands = [_alone(options, bag, out / name) for bag, name in zip(options.bags, names)]
     rows = []
     try:
@@ -217,6 +234,7 @@ def _alone(options: argparse.Namespace, bag: str, out: Path) -> str:
     words += ["--namespace", options.namespace] if options.namespace is not None else []
     words += ["--material", f"{options.material:g}"] if options.material != MATERIAL_SHARE else []
     words += ["--seconds", f"{options.seconds:g}"] if options.seconds is not None else []
+    words += [word for file in options.effects for word in ("--effects", file)]
     return shlex.join(words + ["--fit-nominal"] * options.fit_nominal)
 
 

@@ -10,9 +10,9 @@ import csv
 import signal
 import time
 import warnings
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from aeropend_ident.diagnosis.results import Results, document
 from aeropend_ident.result_folder import OutputError, on_interrupt
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import Signals
+from aeropend_sim.model import effect_file
 from aeropend_sim.model.parameters import Model
 from aeropend_sim.untrusted import one_line, printable
 
@@ -47,6 +48,8 @@ class Settings:
         fit_nominal: whether the rigs are uncalibrated.
         material: share of the gap from which an effect is claimed.
         seconds: [s] that each search may take; None: a budget of simulations bounds it where it may be long.
+        further: ids of effects of effect files that are tried too.
+        definitions: of all effects by formula, which the processes have to know.
     """
 
     model: Model
@@ -56,6 +59,8 @@ class Settings:
     fit_nominal: bool = False
     material: float = MATERIAL_SHARE
     seconds: float | None = None
+    further: tuple[str, ...] = ()
+    definitions: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -147,10 +152,13 @@ def _examine(task: _Task) -> Outcome:
     started = time.monotonic()
     # never lifted: threads of one worker share the limit
     threadpool_limits(1)
+    settings = task.settings
     try:
-        found = diagnose(task.settings.model, [task.signals], 1, fit_nominal=task.settings.fit_nominal,
-                         material=task.settings.material, seconds=task.settings.seconds)
-        made = document(found, [task.bag], task.settings.name, task.reading + time.monotonic() - started)
+        if settings.definitions:
+            effect_file.define(settings.definitions, task.bag)
+        found = diagnose(settings.model, [task.signals], 1, fit_nominal=settings.fit_nominal,
+                         material=settings.material, seconds=settings.seconds, further=settings.further)
+        made = document(found, [task.bag], settings.name, task.reading + time.monotonic() - started)
         return Outcome(task.bag, Results.of(found, made, task.command))
     except Exception as error:
         return Outcome(task.bag, None, _why(task.bag, error))

@@ -105,7 +105,7 @@ Progress = Callable[[str, float], None]
 
 def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progress: Progress = lambda *_: None, *,
              fit_nominal: bool = False, material: float = MATERIAL_SHARE, seconds: float | None = None,
-             known: Known | None = None) -> Diagnosis:
+             known: Known | None = None, further: Sequence[str] = ()) -> Diagnosis:
     """Find where a model and a rig differ, which effect causes it, and how far the gap closes.
 
     Args:
@@ -117,6 +117,7 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
         material: share of the gap from which an effect is claimed.
         seconds: [s] that the search may take; None: a budget of simulations bounds it where it may be long.
         known: what earlier verdicts of the rig know of the model; the verdict is then what has changed.
+        further: ids of effects of effect files that are tried beside those of the catalogue.
     """
     with threadpool_limits(1):  # the matrices are narrow: threads of the linear algebra would slow each other down
         policy = policy_of(recordings, fit_nominal=fit_nominal)
@@ -137,6 +138,7 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
         kind = CutChains if policy.calibrated else CachedChains
         chains = with_pwm_timing(kind(model, recordings, policy))
         chains.likely, chains.plain, chains.notes, chains.known = likely, plain, notes, known
+        chains.further = tuple(further)
         return _diagnose(chains, Settings(jobs, material, seconds), progress)
 
 
@@ -266,7 +268,7 @@ def _fitted_further(fitted: CutChains) -> CutChains:
     note = (f"after {s.train * s.period:.1f} s the rig behaves otherwise than before: the fit goes on up to "
             f"{further * s.period:.1f} s, only the rest is held out")
     longer = type(fitted)(fitted.model, [replace(s, train=further).noted(note)], fitted.policy)
-    longer.known = fitted.known
+    longer.known, longer.further = fitted.known, fitted.further
     return longer
 
 

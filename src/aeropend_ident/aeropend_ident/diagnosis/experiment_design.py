@@ -23,7 +23,7 @@ from aeropend_ident.diagnosis.free_run_gap import free_run
 from aeropend_ident.estimation.map_fit import DAMPING, DAMPING_DOWN
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import CHANNELS, Signals
-from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
+from aeropend_sim.model.effects import DEFINED, PARAMETER_MISMATCH
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import MODEL_NAMES, PARAMETERS, SAMPLE_PERIOD, Model
 
@@ -277,8 +277,8 @@ def _free(model: Model, values: Mapping[str, float]) -> dict[str, float]:
     free = {}
     for name, value in values.items():
         k = key(name)
-        if k.owner in CATALOGUE:
-            effect, size = CATALOGUE[k.owner].parameters, CATALOGUE[k.owner].size
+        if k.owner in DEFINED:
+            effect, size = DEFINED[k.owner].parameters, DEFINED[k.owner].size
             if values[f"{k.owner}.{size}"] != effect[size].neutral:
                 p = effect[k.name]
                 free[name] = 3.0 * abs(p.default - p.neutral) or abs(p.default) or 1.0
@@ -299,5 +299,5 @@ def _directly(model: Model, first: Named, second: Named) -> str:
             near = abs(values[parameter] - nominal) / 3.0
             texts.append(f"measure {parameter} ({p.description}) directly to within {near:.2g}{unit}")
         elif effect != PARAMETER_MISMATCH:
-            texts.append(f"look for {effect} directly ({CATALOGUE[effect].physics})")
+            texts.append(f"look for {effect} directly ({DEFINED[effect].physics})")
     return " or ".join(texts) or "measure the parameters of the model directly"

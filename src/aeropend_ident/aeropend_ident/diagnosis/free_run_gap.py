@@ -65,7 +65,7 @@ def free_run(model: Model, signals: Signals, values: Mapping[str, float] | None 
     out = {"theta": np.empty(len(signals)), "omega": _held_speed(run, signals), "i_a": np.empty(len(signals)),
            "v_a": np.empty(len(signals))}
     for piece, m in pieces:
-        reading = sensing.angle_reading(run.theta, run.theta_dot, sensing.prepare(m, signals.period))
+        reading = sensing.read_angle(m, run.theta, run.theta_dot, signals.period)
         out["theta"][piece] = reading[piece]
         out["i_a"][piece] = sensing.read_current(m, run.i_a[piece])
         out["v_a"][piece] = sensing.read_voltage(m, run.v_a[piece])
@@ -78,9 +78,8 @@ def _simulated(signals: Signals, pieces: Sequence[tuple[slice, Model]], state: d
     duty = np.ascontiguousarray(signals.duty, dtype=float)
     for piece, m in pieces:
         v, sampled = actuator.voltages(m.numbers(), duty, m.effects, signals.period, -piece.start)
-        c, e, x = dynamics.prepare(m, signals.period)
         part = np.empty((7, piece.stop - piece.start))
-        state = dynamics.run(v[piece], np.zeros(part.shape[1]), state, c, e, x, part)
+        state = dynamics.run(v[piece], np.zeros(part.shape[1]), state, *dynamics.prepare(m, signals.period), part)
         if "command_delay" in m.effects:
             part[dynamics.ROW.v_a] += (sampled - v)[piece]
         out[:, piece] = part

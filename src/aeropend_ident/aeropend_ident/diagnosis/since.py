@@ -19,7 +19,7 @@ from aeropend_ident.diagnosis.conclude import Statistical, interval
 from aeropend_ident.diagnosis.document import Change, DiagnosisDocument, DocumentError, Estimates, Since
 from aeropend_ident.diagnosis.joint_fit import SURE, WIDER, JointFit
 from aeropend_ident.estimation.parameter import key
-from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.effects import DEFINED
 from aeropend_sim.model.parameters import Model, load
 from aeropend_sim.untrusted import one_line
 
@@ -124,13 +124,13 @@ def changes(known: Known, joint: JointFit, statistical: Statistical, claimed: Co
     changed = []
     for name, material in found.items():
         before, after = neutral(model, name), joint.values[name]
-        new = key(name).owner in CATALOGUE and key(name).owner not in model.effects
+        new = key(name).owner in DEFINED and key(name).owner not in model.effects
         _, sd = compared.change(name, found)
         sd = math.hypot(sd, _from_form(joint, name))
         changed.append(Change(name, limits(name).unit, None if new else interval(before, known.sd(name)),
                               interval(after, joint.sd[name]), interval(after - before, sd), material))
     for s in statistical.found:
-        size = f"{s.hypothesis.effect}.{CATALOGUE[s.hypothesis.effect].size}"
+        size = f"{s.hypothesis.effect}.{DEFINED[s.hypothesis.effect].size}"
         before, after, sd = neutral(model, size), s.fit.values[size], float(np.hypot(known.sd(size), s.fit.sd[size]))
         if s.hypothesis.effect not in model.effects or abs(after - before) > SURE * sd:
             was = interval(before, known.sd(size)) if s.hypothesis.effect in model.effects else None

@@ -9,7 +9,7 @@ import numpy as np
 
 from aeropend_ident.signals.signals import Signals, from_arrays
 from aeropend_sim.model import rig
-from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.effects import DEFINED
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
 from aeropend_sim.model.rig import Rig, Sample
 
@@ -33,7 +33,7 @@ def drawn_rig(seed: int, effects: dict[str, dict[str, float]], off: float = 0.02
     """`bench` with numbers off by a standard deviation of `off`, and effects; missing parameters at their defaults."""
     rng = np.random.default_rng(10_000 + seed)
     numbers = {k: v * (1.0 + off * rng.standard_normal()) for k, v in BENCH.model.items()}
-    full = {id_: {k: p.default for k, p in CATALOGUE[id_].parameters.items()} | given for id_, given in effects.items()}
+    full = {id_: {k: p.default for k, p in DEFINED[id_].parameters.items()} | given for id_, given in effects.items()}
     return Model("rig", numbers, BENCH.sensing, full)
 
 

@@ -14,7 +14,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from aeropend_sim.model.parameters import Model
+from aeropend_sim.model.effects import DEFINED
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+from aeropend_sim.model.terms import series
 
 Array = NDArray[np.float64]
 Numbers = Mapping[str, float]
@@ -146,18 +148,30 @@ def _over_hold(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str,
 ScalarOrArray = TypeVar("ScalarOrArray", float, Array)
 
 
-def terminal_voltage(model: Model, voltage: ScalarOrArray, current: ScalarOrArray) -> ScalarOrArray:
+def terminal_voltage(model: Model, voltage: ScalarOrArray, current: ScalarOrArray, period: float = SAMPLE_PERIOD
+                     ) -> ScalarOrArray:
     """Voltage at the motor's terminals.
 
     Args:
-        model: its effect `supply_sag` acts.
+        model: its effect `supply_sag` acts, and its effects by formula at place `actuator`.
         voltage: [V] scalar or (N,) voltage at the bridge without load, from `acting_voltage` or `sampled_voltage`.
         current: [A] armature current, in the same shape.
+        period: [s] time between samples.
 
     Returns:
-        [V] v - r_supply i, in the same shape.
+        [V] v - r_supply i, in the same shape; (N,) with effects by formula.
     """
-    return voltage - model.effect("supply_sag", "r_supply") * current
+    loaded = voltage - model.effect("supply_sag", "r_supply") * current
+    if any(DEFINED[id_].term and DEFINED[id_].place == "actuator" for id_ in model.effects if id_ in DEFINED):
+        v, i = np.broadcast_arrays(np.atleast_1d(voltage), np.atleast_1d(current))
+        loaded = loaded + series(model.effects, "actuator", len(v), period, v=v, i_a=i)  # type: ignore[assignment]
+    return loaded
+
+
+def behind_terminals(model: Model) -> Model:
+    """The model without the effects that act between bridge and terminals: a measured voltage holds them."""
+    return model.with_effects({id_: p for id_, p in model.effects.items() if id_ != "supply_sag" and not (
+        id_ in DEFINED and DEFINED[id_].term and DEFINED[id_].place == "actuator")})
 
 
 def static_angle(numbers: Numbers, duty: ArrayLike) -> Array:

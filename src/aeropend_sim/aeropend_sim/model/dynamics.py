@@ -16,6 +16,7 @@ docs/interfaces.md). Equations of the effects: docs/effects.md.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +24,18 @@ from numpy.typing import NDArray
 
 from aeropend_sim.compiled import njit
 from aeropend_sim.model import actuator
-from aeropend_sim.model.effects import Values, values
+from aeropend_sim.model.effects import NO_EFFECT, Values, values
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+from aeropend_sim.model.terms import (
+    EMPTY,
+    NUDGE,
+    Memory,
+    Quantities,
+    Terms,
+    remembered,
+    term_sum,
+    terms,
+)
 
 Array = NDArray[np.float64]
 
@@ -45,6 +56,12 @@ BRUSH_CURRENT = 0.02
 
 LONGEST_STEP = 2.5e-3
 """[s] Longest step. Measured: over a longer one the error exceeds 2e-5 of the range of each state of `bench`."""
+
+SAMPLED = 64
+"""Points at which the slopes of terms by formula are sampled. A choice."""
+
+RATIO = 0.5 * (math.sqrt(5.0) - 1.0)
+"""Golden ratio: its multiples fill an interval evenly (derived)."""
 
 MOST_STEPS = 1000
 """Greatest number of steps of a hold, also for the fastest plant. A choice."""
@@ -133,7 +150,7 @@ class Extra(NamedTuple):
 
 
 class State(NamedTuple):
-    """State of the plant at an instant, SI units. The last four belong to effects and are 0 without them."""
+    """State of the plant at an instant, SI units. The last six belong to effects and are 0 without them."""
 
     i_a: float = 0.0
     omega: float = 0.0
@@ -145,6 +162,8 @@ class State(NamedTuple):
     flex: float = 0.0
     flex_dot: float = 0.0
     gust: float = 0.0
+    time: float = 0.0
+    memory: Memory = EMPTY
 
 
 class Over(NamedTuple):
@@ -153,6 +172,21 @@ class Over(NamedTuple):
     start: float
     middle: float
     end: float
+
+
+class Past(NamedTuple):
+    """Time (s), and the states of effects by formula, at an instant."""
+
+    time: float
+    memory: Memory
+
+
+class Pasts(NamedTuple):
+    """`Past` over one step."""
+
+    start: Past
+    middle: Past
+    end: Past
 
 
 class Motion(NamedTuple):
@@ -191,6 +225,36 @@ def near(sin_x: float, cos_x: float, d: float) -> float:
 
 
 @equation
+def volts(i: float, w: float, v: float, t: float, memory: Memory, added: Terms) -> float:
+    """[V] Sum of the terms by formula at the actuator and in the winding."""
+    q = Quantities(0.0, 0.0, w, 0.0, i, v, t)
+    return term_sum(0, added.electrical, q, memory, added)
+
+
+@equation
+def linear_volts(i: float, w: float, v: float, p: Past, added: Terms) -> tuple[float, float]:
+    """`volts` made linear around a current: its value at no current (V), and its slope (Ω)."""
+    nudge = NUDGE * max(abs(i), 0.1)
+    here = volts(i, w, v, p.time, p.memory, added)
+    slope = (volts(i + nudge, w, v, p.time, p.memory, added) - here) / nudge
+    return here - slope * i, slope
+
+
+@equation
+def rotor_terms(i: float, w: float, v: float, p: Past, added: Terms) -> float:
+    """[N·m] Sum of the terms by formula on the rotor."""
+    return term_sum(added.electrical, added.rotor, Quantities(0.0, 0.0, w, 0.0, i, v, p.time), p.memory, added)
+
+
+@equation
+def arm_terms(motion: Motion, f: float, w: float, p: Past, c: Coefficients, added: Terms) -> float:
+    """[rad/s²] Sum of the terms by formula of the thrust and on the arm, over the arm's inertia."""
+    q = Quantities(motion.theta, motion.theta_dot, w, f, 0.0, 0.0, p.time)
+    return (c.lever * term_sum(added.rotor, added.thrust, q, p.memory, added)
+            + term_sum(added.thrust, added.arm, q, p.memory, added))
+
+
+@equation
 def winding(i0: float, v: float, speed: Over, k: Lag, c: Coefficients) -> tuple[float, float]:
     """L_a di/dt = v - R_a i - K_e ω, thesis (3.5), over one step.
 
@@ -211,7 +275,7 @@ def winding(i0: float, v: float, speed: Over, k: Lag, c: Coefficients) -> tuple[
 
 
 @equation
-def rotor(current: Over, speed: Over, friction: float, c: Coefficients) -> tuple[float, float]:
+def rotor(current: Over, speed: Over, friction: float, c: Coefficients, more: Over | None) -> tuple[float, float]:
     """J_m dω/dt = K_t i - B_m ω - k_load ω|ω| over one step.
 
     Args:
@@ -219,6 +283,7 @@ def rotor(current: Over, speed: Over, friction: float, c: Coefficients) -> tuple
         speed: [rad/s] ω at the start, and estimates of it in the middle and at the end, which give the quadratic load.
         friction: [rad/s²] Coulomb torque over inertia, with its sign.
         c: coefficients.
+        more: [rad/s²] further torque over inertia.
 
     Returns:
         [rad/s] speed in the middle and at the end.
@@ -226,14 +291,16 @@ def rotor(current: Over, speed: Over, friction: float, c: Coefficients) -> tuple
     g0 = c.torque * current.start - c.load * speed.start * abs(speed.start) - friction
     gm = c.torque * current.middle - c.load * speed.middle * abs(speed.middle) - friction
     g1 = c.torque * current.end - c.load * speed.end * abs(speed.end) - friction
+    if more is not None:
+        g0, gm, g1 = g0 + more.start, gm + more.middle, g1 + more.end
     k = c.rotor
     return (k.half_decay * speed.start + k.u0 * g0 + k.u1 * gm + k.u2 * g1,
             k.decay * speed.start + k.w0 * g0 + k.w1 * gm + k.w2 * g1)
 
 
 @equation
-def winding_rotor(i0: float, w0: float, v: float, heat: float, c: Coefficients, e: Values | None,
-                  x: Extra | None) -> tuple[float, float, float, float]:
+def winding_rotor(i0: float, w0: float, v: float, heat: float, past: Pasts | None, c: Coefficients, e: Values | None,
+                  x: Extra | None, added: Terms | None) -> tuple[float, float, float, float]:
     """Winding and rotor together over one step, by two sweeps over the pair.
 
     Args:
@@ -241,9 +308,11 @@ def winding_rotor(i0: float, w0: float, v: float, heat: float, c: Coefficients, 
         w0: [rad/s] speed at the start.
         v: [V] voltage, constant.
         heat: [A²s] state of `winding_heating` in the middle.
+        past: time and memories; None without terms.
         c: coefficients.
         e: effects.
         x: coefficients of the effects.
+        added: terms by formula.
 
     Returns:
         Current in the middle and at the end, speed in the middle and at the end.
@@ -256,22 +325,36 @@ def winding_rotor(i0: float, w0: float, v: float, heat: float, c: Coefficients, 
         if w0 < 0.0 or (w0 == 0.0 and drive < 0.0):
             friction = -friction
     slope = c.h * (c.torque * i0 - c.load * w0 * abs(w0) - c.drag * w0 - friction)
+    if added is not None and added.rotor > added.electrical:
+        slope += c.h * rotor_terms(i0, w0, v, past.start, added) / x.J_m
     wm, w1 = w0 + 0.5 * slope, w0 + slope
     if sticks:
         wm, w1 = 0.0, 0.0
     im, i1 = i0, i0
-    k, drop, pieces = c.winding, 0.0, 1
+    k, resistance, drop, pieces = c.winding, 0.0, 0.0, 1
+    if added is not None:
+        resistance = x.R_total
     if e is not None and (e.brush_drop_v_brush > 0.0 or e.winding_heating_gain > 0.0):
-        k, drop, pieces = linearised_winding(i0, v - c.K_e * w0, heat, c, e, x)
+        resistance, drop, pieces = linearised_winding(i0, v - c.K_e * w0, heat, c, e, x)
+        k = lag(resistance * c.per_L, c.h)
     for _ in range(2):
+        more = drop
+        if added is not None and added.electrical > 0:
+            constant, fall = linear_volts(im, wm, v, past.middle, added)
+            k, more = lag((resistance - fall) * c.per_L, c.h), drop - constant
         if e is not None and pieces > 1:
-            im, i1 = brush_winding(i0, v, Over(w0, wm, w1), heat, pieces, c, e, x)
+            im, i1 = brush_winding(i0, v, Over(w0, wm, w1), heat, pieces, past, c, e, x, added)
         else:
-            im, i1 = winding(i0, v - drop, Over(w0, wm, w1), k, c)
+            im, i1 = winding(i0, v - more, Over(w0, wm, w1), k, c)
         if sticks:
             wm, w1 = breakaway(Over(c.torque * i0, c.torque * im, c.torque * i1), abs(friction), 0.5 * c.h)
+        elif added is not None and added.rotor > added.electrical:
+            torque = Over(rotor_terms(i0, w0, v, past.start, added) / x.J_m,
+                          rotor_terms(im, wm, v, past.middle, added) / x.J_m,
+                          rotor_terms(i1, w1, v, past.end, added) / x.J_m)
+            wm, w1 = rotor(Over(i0, im, i1), Over(w0, wm, w1), friction, c, torque)
         else:
-            wm, w1 = rotor(Over(i0, im, i1), Over(w0, wm, w1), friction, c)
+            wm, w1 = rotor(Over(i0, im, i1), Over(w0, wm, w1), friction, c, None)
     if e is not None and not sticks and friction * w1 < 0.0:
         wm, w1 = wm if w0 * wm > 0.0 else 0.0, 0.0  # it stops; the next step decides whether it turns again
     return im, i1, wm, w1
@@ -309,7 +392,7 @@ def brush_sign(i: float) -> float:
 
 @equation
 def linearised_winding(i0: float, v: float, heat: float, c: Coefficients, e: Values, x: Extra | None
-                       ) -> tuple[Lag, float, int]:
+                       ) -> tuple[float, float, int]:
     """The winding with brushes and heat, v - v_brush tanh(i/0.02) - R(T) i - K_e ω, made linear around i0.
 
     Args:
@@ -321,26 +404,26 @@ def linearised_winding(i0: float, v: float, heat: float, c: Coefficients, e: Val
         x: coefficients of the effects.
 
     Returns:
-        The weights of the winding, the constant part of the brush drop (V), and the number of pieces into which the
-        step must be cut: more than one if the current crosses the bend of the tanh.
+        The resistance with that of the brushes (Ω), the constant part of the brush drop (V), and the number of pieces
+        into which the step must be cut: more than one if the current crosses the bend of the tanh.
     """
     resistance = x.R_total + x.R_a * e.winding_heating_gain * heat
     if e.brush_drop_v_brush == 0.0:
-        return lag(resistance * c.per_L, c.h), 0.0, 1
+        return resistance, 0.0, 1
     t = brush_sign(i0)
     stiffness = e.brush_drop_v_brush * (1.0 - t * t) / BRUSH_CURRENT
-    k = lag((resistance + stiffness) * c.per_L, c.h)
+    decay = math.exp(-(resistance + stiffness) * c.per_L * c.h)
     drop = e.brush_drop_v_brush * t - stiffness * i0
-    i1 = k.decay * i0 + (1.0 - k.decay) * (v - drop) / (resistance + stiffness)
+    i1 = decay * i0 + (1.0 - decay) * (v - drop) / (resistance + stiffness)
     pieces = 1  # the limits below are choices: pieces of 0.2 BRUSH_CURRENT near the bend, at most 16
     if i0 * i1 < 0.0 or min(abs(i0), abs(i1)) < 6.0 * BRUSH_CURRENT:
         pieces = 1 + min(15, int(abs(i1 - i0) / (0.2 * BRUSH_CURRENT)))
-    return k, drop, pieces
+    return resistance + stiffness, drop, pieces
 
 
 @equation
-def brush_winding(i0: float, v: float, speed: Over, heat: float, pieces: int, c: Coefficients, e: Values,
-                  x: Extra | None) -> tuple[float, float]:
+def brush_winding(i0: float, v: float, speed: Over, heat: float, pieces: int, past: Pasts | None, c: Coefficients,
+                  e: Values, x: Extra | None, added: Terms | None) -> tuple[float, float]:
     """As `winding`, the step cut into pieces, and made linear in each (exponential Rosenbrock-Euler method).
 
     Args:
@@ -349,9 +432,11 @@ def brush_winding(i0: float, v: float, speed: Over, heat: float, pieces: int, c:
         speed: [rad/s] ω.
         heat: [A²s] T in the middle of the step.
         pieces: number of pieces; an odd number is raised by one.
+        past: time and memories; None without terms.
         c: coefficients.
         e: effects.
         x: coefficients of the effects.
+        added: terms by formula.
 
     Returns:
         [A] current in the middle and at the end.
@@ -367,6 +452,10 @@ def brush_winding(i0: float, v: float, speed: Over, heat: float, pieces: int, c:
         t = brush_sign(i)
         total = resistance + e.brush_drop_v_brush * (1.0 - t * t) / BRUSH_CURRENT
         forcing = v - c.K_e * w - e.brush_drop_v_brush * t - resistance * i
+        if added is not None:
+            constant, fall = linear_volts(i, w, v, past.middle, added)
+            total -= fall
+            forcing += constant + fall * i
         i += (1.0 - math.exp(-total * c.per_L * h)) / total * forcing
         if 2 * (j + 1) == pieces:
             im = i
@@ -444,8 +533,8 @@ def flex_restoring(flex: float, flex_dot: float, e: Values) -> float:
 
 
 @equation
-def arm(motion: Motion, thrust: Over, speed: Over, friction: float, gust: float, c: Coefficients, e: Values | None,
-        x: Extra | None) -> Motion:
+def arm(motion: Motion, thrust: Over, speed: Over, friction: float, gust: float, past: Pasts | None, c: Coefficients,
+        e: Values | None, x: Extra | None, added: Terms | None) -> Motion:
     """The arm, and the mode of the mast, over one step by the Runge-Kutta-Nyström method of fourth order.
 
     Args:
@@ -454,9 +543,11 @@ def arm(motion: Motion, thrust: Over, speed: Over, friction: float, gust: float,
         speed: [rad/s] speed of the rotor.
         friction: [rad/s²] dry friction over inertia, with the sign of the motion.
         gust: [rad/s²] random torque over inertia, constant.
+        past: time and memories; None without terms.
         c: coefficients.
         e: effects.
         x: coefficients of the effects.
+        added: terms by formula.
 
     Returns:
         The motion at the end.
@@ -473,17 +564,23 @@ def arm(motion: Motion, thrust: Over, speed: Over, friction: float, gust: float,
     sin_1, cos_1 = sin_m * cos_d + cos_m * sin_d, cos_m * cos_d - sin_m * sin_d
     g0, gm, g1 = near_ground(y, e), near_ground(y + d, e), near_ground(y + 2.0 * d, e)
     f0 = thrust.start + thrust.start * g0
-    a1, b1 = arm_stage(sin_m * cos_d - cos_m * sin_d, motion, f0, speed.start, torque, c, e, x)
+    more = torque if added is None else torque + arm_terms(motion, f0, speed.start, past.start, c, added)
+    a1, b1 = arm_stage(sin_m * cos_d - cos_m * sin_d, motion, f0, speed.start, more, c, e, x)
     bend = 0.5 * s * s * a1
     sin_m, middle, qm = near(sin_m, cos_m, bend), y + d + bend, q + s * (qd + 0.5 * s * b1)
     fm = thrust.middle + thrust.middle * nearer_ground(gm, y + d, middle, e, x)
-    a2, b2 = arm_stage(sin_m, Motion(middle, yd + s * a1, qm, qd + s * b1), fm, speed.middle, torque, c, e, x)
-    a3, b3 = arm_stage(sin_m, Motion(middle, yd + s * a2, qm, qd + s * b2), fm, speed.middle, torque, c, e, x)
+    second = Motion(middle, yd + s * a1, qm, qd + s * b1)
+    more = torque if added is None else torque + arm_terms(second, fm, speed.middle, past.middle, c, added)
+    a2, b2 = arm_stage(sin_m, second, fm, speed.middle, more, c, e, x)
+    third = Motion(middle, yd + s * a2, qm, qd + s * b2)
+    more = torque if added is None else torque + arm_terms(third, fm, speed.middle, past.middle, c, added)
+    a3, b3 = arm_stage(sin_m, third, fm, speed.middle, more, c, e, x)
     bend = c.h * s * a3
     end = y + 2.0 * d + bend
     last = Motion(end, yd + c.h * a3, q + c.h * (qd + s * b3), qd + c.h * b3)
     f1 = thrust.end + thrust.end * nearer_ground(g1, y + 2.0 * d, end, e, x)
-    a4, b4 = arm_stage(near(sin_1, cos_1, bend), last, f1, speed.end, torque, c, e, x)
+    more = torque if added is None else torque + arm_terms(last, f1, speed.end, past.end, c, added)
+    a4, b4 = arm_stage(near(sin_1, cos_1, bend), last, f1, speed.end, more, c, e, x)
     return Motion(
         y + c.h * (yd + s * (1.0 / 3.0) * (a1 + a2 + a3)), yd + s * (1.0 / 3.0) * (a1 + 2.0 * (a2 + a3) + a4),
         q + c.h * (qd + s * (1.0 / 3.0) * (b1 + b2 + b3)), qd + s * (1.0 / 3.0) * (b1 + 2.0 * (b2 + b3) + b4))
@@ -524,8 +621,8 @@ def mast_alone(q: float, qd: float, c: Coefficients, e: Values) -> tuple[float, 
 
 
 @equation
-def arm_with_dry_friction(motion: Motion, thrust: Over, speed: Over, gust: float, c: Coefficients, e: Values,
-                          x: Extra | None) -> Motion:
+def arm_with_dry_friction(motion: Motion, thrust: Over, speed: Over, gust: float, past: Pasts | None, c: Coefficients,
+                          e: Values, x: Extra | None, added: Terms | None) -> Motion:
     """As `arm`, with Coulomb friction.
 
     Where the motion reverses, the step is cut at that instant. There the arm sticks, unless the drive is greater than
@@ -536,9 +633,11 @@ def arm_with_dry_friction(motion: Motion, thrust: Over, speed: Over, gust: float
         thrust: [N] thrust, without the ground effect.
         speed: [rad/s] speed of the rotor.
         gust: [rad/s²] random torque over inertia, constant.
+        past: time and memories; None without terms.
         c: coefficients.
         e: effects.
         x: coefficients of the effects.
+        added: terms by formula.
 
     Returns:
         The motion at the end.
@@ -547,19 +646,22 @@ def arm_with_dry_friction(motion: Motion, thrust: Over, speed: Over, gust: float
     limit = e.coulomb_friction_accel
     direction = 1.0 if yd > 0.0 else -1.0
     if yd == 0.0:
-        drive = arm_drive(math.sin(y), motion, thrust.start * (1.0 + near_ground(y, e)), speed.start, gust, c, e)
+        f = thrust.start * (1.0 + near_ground(y, e))
+        torque = gust if added is None else gust + arm_terms(motion, f, speed.start, past.start, c, added)
+        drive = arm_drive(math.sin(y), motion, f, speed.start, torque, c, e)
         if abs(drive) <= limit:  # it sticks; the mast swings on alone
             q, qd = mast_alone(q, qd, c, e)
             return Motion(y, 0.0, q, qd)
         direction = 1.0 if drive > 0.0 else -1.0
-    after = arm(motion, thrust, speed, direction * limit, gust, c, e, x)
+    after = arm(motion, thrust, speed, direction * limit, gust, past, c, e, x, added)
     if yd == 0.0 or yd * after.theta_dot > 0.0:
         return after
     reached = yd / (yd - after.theta_dot) if yd != after.theta_dot else 1.0
     turn = y + 0.5 * reached * c.h * yd
     f = (thrust.start + reached * (thrust.end - thrust.start)) * (1.0 + near_ground(turn, e))
     resting = Motion(turn, 0.0, after.flex, after.flex_dot)
-    drive = arm_drive(math.sin(turn), resting, f, speed.end, gust, c, e)
+    torque = gust if added is None else gust + arm_terms(resting, f, speed.end, past.end, c, added)
+    drive = arm_drive(math.sin(turn), resting, f, speed.end, torque, c, e)
     if abs(drive) <= limit:
         return resting
     rest = (1.0 - reached) * c.h
@@ -568,16 +670,48 @@ def arm_with_dry_friction(motion: Motion, thrust: Over, speed: Over, gust: float
 
 
 @equation
-def advance_motor(state: State, v: float, c: Coefficients, e: Values | None, x: Extra | None
-                  ) -> tuple[float, float, float, float, float]:
+def quantities(state: State, v: float) -> Quantities:
+    """What formulas take, from the state of the plant and the voltage."""
+    return Quantities(state.theta, state.theta_dot, state.omega, state.thrust, state.i_a, v, state.time)
+
+
+@equation
+def pasts(state: State, v: float, c: Coefficients, added: Terms) -> Pasts:
+    """Time and memories over a step, predicted from its start."""
+    start = Past(state.time, state.memory)
+    middle, end = Past(state.time + 0.5 * c.h, state.memory), Past(state.time + c.h, state.memory)
+    if added.memories == 0:
+        return Pasts(start, middle, end)
+    q = quantities(state, v)
+    q = Quantities(q.theta + 0.5 * c.h * q.theta_dot, q.theta_dot, q.omega, q.thrust, q.i_a, q.v, middle.time)
+    half = remembered(state.memory, state.memory, q, 0.5 * c.h, added)
+    return Pasts(start, Past(middle.time, half), Past(end.time, remembered(state.memory, half, q, c.h, added)))
+
+
+@equation
+def past_after(state: State, after: State, v: float, past: Pasts, c: Coefficients, added: Terms) -> Past:
+    """Time and memories at the end of a step whose other quantities are known."""
+    if added.memories == 0:
+        return past.end
+    a, b = quantities(state, v), quantities(after, v)
+    q = Quantities(0.5 * (a.theta + b.theta), 0.5 * (a.theta_dot + b.theta_dot), 0.5 * (a.omega + b.omega),
+                   0.5 * (a.thrust + b.thrust), 0.5 * (a.i_a + b.i_a), v, past.middle.time)
+    return Past(past.end.time, remembered(state.memory, past.middle.memory, q, c.h, added))
+
+
+@equation
+def advance_motor(state: State, v: float, past: Pasts | None, c: Coefficients, e: Values | None, x: Extra | None,
+                  added: Terms | None) -> tuple[float, float, float, float, float]:
     """Winding and rotor over one step.
 
     Args:
         state: at the start.
         v: [V] voltage, constant.
+        past: time and memories; None without terms.
         c: coefficients.
         e: effects.
         x: coefficients of the effects.
+        added: terms by formula.
 
     Returns:
         Current at the end, speed in the middle and at the end, rotor angle and heat at the end.
@@ -586,7 +720,7 @@ def advance_motor(state: State, v: float, c: Coefficients, e: Values | None, x: 
     heat = state.heat
     if e is not None and e.winding_heating_gain > 0.0:
         heat += 0.5 * c.h * (i0 * i0 - heat / e.winding_heating_tau)
-    im, i1, wm, w1 = winding_rotor(i0, w0, v, heat, c, e, x)
+    im, i1, wm, w1 = winding_rotor(i0, w0, v, heat, past, c, e, x, added)
     angle = state.rotor_angle + c.h * (1.0 / 6.0) * (w0 + 4.0 * wm + w1)
     heat = 0.0
     if e is not None and e.winding_heating_gain > 0.0:
@@ -596,17 +730,19 @@ def advance_motor(state: State, v: float, c: Coefficients, e: Values | None, x: 
 
 
 @equation
-def advance_arm(state: State, wm: float, w1: float, c: Coefficients, e: Values | None, x: Extra | None
-                ) -> tuple[Motion, float]:
+def advance_arm(state: State, wm: float, w1: float, past: Pasts | None, c: Coefficients, e: Values | None,
+                x: Extra | None, added: Terms | None) -> tuple[Motion, float]:
     """Air and arm over one step.
 
     Args:
         state: at the start.
         wm: [rad/s] speed of the rotor in the middle.
         w1: [rad/s] speed of the rotor at the end.
+        past: time and memories; None without terms.
         c: coefficients.
         e: effects.
         x: coefficients of the effects.
+        added: terms by formula.
 
     Returns:
         The motion and the thrust (N) at the end.
@@ -616,7 +752,8 @@ def advance_arm(state: State, wm: float, w1: float, c: Coefficients, e: Values |
     f0 = static_thrust(w0, c, e)
     fm, f1 = static_thrust_near(wm, w0, f0, c, e), static_thrust_near(w1, w0, f0, c, e)
     if e is None:
-        return arm(Motion(state.theta, state.theta_dot, 0.0, 0.0), Over(f0, fm, f1), speed, 0.0, 0.0, c, e, x), f1
+        return arm(Motion(state.theta, state.theta_dot, 0.0, 0.0), Over(f0, fm, f1), speed, 0.0, 0.0, None, c, e, x,
+                   None), f1
     if e.thrust_lag_tau > NO_LAG * c.h:
         k, a = x.air, 1.0 / e.thrust_lag_tau
         if e.thrust_lag_fall != 1.0 and fm < state.thrust:
@@ -627,12 +764,12 @@ def advance_arm(state: State, wm: float, w1: float, c: Coefficients, e: Values |
                   k.decay * f0 + k.w0 * s0 + k.w1 * sm + k.w2 * s1)
     motion = Motion(state.theta, state.theta_dot, state.flex, state.flex_dot)
     if e.coulomb_friction_accel > 0.0:
-        return arm_with_dry_friction(motion, Over(f0, fm, f1), speed, state.gust, c, e, x), f1
-    return arm(motion, Over(f0, fm, f1), speed, 0.0, state.gust, c, e, x), f1
+        return arm_with_dry_friction(motion, Over(f0, fm, f1), speed, state.gust, past, c, e, x, added), f1
+    return arm(motion, Over(f0, fm, f1), speed, 0.0, state.gust, past, c, e, x, added), f1
 
 
 @equation
-def advance(state: State, v: float, c: Coefficients, e: Values | None, x: Extra | None) -> State:
+def advance(state: State, v: float, c: Coefficients, e: Values | None, x: Extra | None, added: Terms | None) -> State:
     """The whole plant over one step, the gust held.
 
     Args:
@@ -641,10 +778,24 @@ def advance(state: State, v: float, c: Coefficients, e: Values | None, x: Extra 
         c: coefficients.
         e: effects; None for the nominal plant.
         x: coefficients of the effects; None for the nominal plant.
+        added: terms by formula; None without any.
     """
-    i1, wm, w1, angle, heat = advance_motor(state, v, c, e, x)
-    m, f1 = advance_arm(state, wm, w1, c, e, x)
-    return State(i1, w1, angle, m.theta, m.theta_dot, f1, heat, m.flex, m.flex_dot, state.gust)
+    past = None if added is None else pasts(state, v, c, added)
+    i1, wm, w1, angle, heat = advance_motor(state, v, past, c, e, x, added)
+    m, f1 = advance_arm(state, wm, w1, past, c, e, x, added)
+    after = State(i1, w1, angle, m.theta, m.theta_dot, f1, heat, m.flex, m.flex_dot, state.gust, state.time,
+                  state.memory)
+    if added is None or past is None:
+        return after
+    return since(after, past_after(state, after, v, past, c, added))
+
+
+@equation
+def since(state: State, past: Past) -> State:
+    """The state with this time and these memories."""
+    s = state
+    return State(s.i_a, s.omega, s.rotor_angle, s.theta, s.theta_dot, s.thrust, s.heat, s.flex, s.flex_dot, s.gust,
+                 past.time, past.memory)
 
 
 def steady(model: Model, duty: float) -> State:
@@ -671,7 +822,7 @@ def steps_in(model: Model, period: float) -> int:
         model: parameters and effects.
         period: [s] length of the hold.
     """
-    n, e = model.numbers(), values(model.effects)
+    n, e, added = model.numbers(), values(model.effects), terms(model.effects)
     top_speed = float(actuator.voltage(n, 1.0)) / n["K_e"]  # rad/s, never reached
     back = n["K_t"] * n["K_e"] / (n["J_m"] * n["L_a"])  # 1/s²: the speed acts back on itself through the winding
     rates = [1.0 / LONGEST_STEP,
@@ -688,11 +839,52 @@ def steps_in(model: Model, period: float) -> int:
         if e.mast_flex_coupling > 0.0:
             rates += [e.mast_flex_omega / math.sqrt(free) / 0.3,
                       2.0 * e.mast_flex_zeta * e.mast_flex_omega / free / 0.3]
+    if added is not None:
+        rates += [rate / 0.3 for rate in term_rates(n, top_speed, added)]
     return min(MOST_STEPS, math.ceil(period * max(rates) - 1e-9))
 
 
+@njit()
+def _slopes(first: int, end: int, points: Array, column: int, added: Terms) -> float:
+    """Steepest slope of some terms with a quantity, over points (7, N)."""
+    steepest = 0.0
+    for k in range(points.shape[1]):
+        p = points[:, k].copy()
+        here = term_sum(first, end, Quantities(p[0], p[1], p[2], p[3], p[4], p[5], p[6]), EMPTY, added)
+        nudge = NUDGE * max(abs(p[column]), 1e-3)
+        p[column] += nudge
+        there = term_sum(first, end, Quantities(p[0], p[1], p[2], p[3], p[4], p[5], p[6]), EMPTY, added)
+        slope = abs(there - here) / nudge
+        if slope > steepest and math.isfinite(slope):
+            steepest = slope
+    return steepest
+
+
+def term_rates(n: Mapping[str, float], top_speed: float, added: Terms) -> tuple[float, float, float]:
+    """[1/s] Rates of the motions that terms by formula cause: of arm's rate, arm's angle and rotor.
+
+    Slopes are sampled, near standstill densely: there friction bends most.
+
+    Args:
+        n: parameters of the model.
+        top_speed: [rad/s] of the rotor.
+        added: terms.
+    """
+    share = np.array([(0.5 + k * RATIO) % 1.0 - 0.5 for k in range(SAMPLED)])
+    near = 20.0 * share * np.exp(-1.0 * (np.arange(SAMPLED) % 10))
+    points = np.zeros((7, SAMPLED))
+    points[0], points[1], points[2] = 2.0 * share, near, top_speed * (share + 0.5)
+    points[3] = n["k_thrust"] * points[2] ** 2
+    lever = n["L_over_J"]
+    ends = added.electrical, added.rotor, added.thrust, added.arm
+    (rotor, _), (thrust, thrust_angle), (arm, arm_angle) = (
+        (_slopes(a, b, points, column, added), _slopes(a, b, points, 0, added))
+        for a, b, column in zip(ends, ends[1:], (2, 1, 1)))
+    return arm + lever * thrust, math.sqrt(arm_angle + lever * thrust_angle), rotor / n["J_m"]
+
+
 def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0
-            ) -> tuple[Coefficients, Values | None, Extra | None]:
+            ) -> tuple[Coefficients, Values | None, Extra | None, Terms | None]:
     """Coefficients of a model for `run`, `run_arm` and `run_motor`.
 
     Args:
@@ -701,10 +893,13 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0
         steps: steps of a hold; 0: `steps_in` decides.
 
     Returns:
-        The coefficients, the effects, and the coefficients of the effects. The last two are None without effects.
+        The coefficients, the effects, the coefficients of the effects, and their terms by formula. What the model does
+        not need is None.
     """
     n = model.numbers()
-    e = values(model.effects)
+    e, added = values(model.effects), terms(model.effects)
+    if e is None and added is not None:
+        e = NO_EFFECT
     steps = steps or steps_in(model, period)
     h = period / steps
     resistance = n["R_a"] + (e.supply_sag_r_supply if e else 0.0)
@@ -712,12 +907,12 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0
                      n["K_e"], n["K_t"] / n["J_m"], n["k_load"] / n["J_m"], n["B_m"] / n["J_m"], n["k_thrust"],
                      n["mgd_over_J"], n["c_over_J"], n["L_over_J"])
     if e is None:
-        return c, None, None
+        return c, None, None, None
     rise = 1.0 / e.thrust_lag_tau if e.thrust_lag_tau > NO_LAG * h else 0.0
     gust_decay = math.exp(-period / e.gust_tau)
     return c, e, Extra(lag(1.0 / e.winding_heating_tau, h), lag(rise, h), lag(rise / e.thrust_lag_fall, h), n["R_a"],
                        resistance, n["J_m"], gust_decay, e.gust_sigma * math.sqrt(1.0 - gust_decay**2),
-                       1.0 / (1.0 - e.mast_flex_coupling), 1.0 / e.ground_effect_width)
+                       1.0 / (1.0 - e.mast_flex_coupling), 1.0 / e.ground_effect_width), added
 
 
 class Trajectory(NamedTuple):
@@ -773,7 +968,8 @@ def linear_arm(stiffness: float, damping: float, h: float) -> tuple[float, float
 
 
 @njit(nogil=True)
-def run(v: Array, noise: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
+def run(v: Array, noise: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, added: Terms | None,
+        out: Array) -> State:
     """Advance the plant over N holds.
 
     Args:
@@ -783,6 +979,7 @@ def run(v: Array, noise: Array, state: State, c: Coefficients, e: Values | None,
         c: coefficients.
         e: effects; None for the nominal plant.
         x: coefficients of the effects; None for the nominal plant.
+        added: terms by formula; None without any.
         out: (7, N), filled with the states at the start of each hold, in the order of `Trajectory`.
 
     Returns:
@@ -796,17 +993,20 @@ def run(v: Array, noise: Array, state: State, c: Coefficients, e: Values | None,
             out[ROW.v_a, k] = v[k]
         else:
             out[ROW.v_a, k] = v[k] - e.supply_sag_r_supply * state.i_a
+            if added is not None:
+                out[ROW.v_a, k] += term_sum(0, added.actuator, quantities(state, v[k]), state.memory, added)
         for _ in range(c.steps):
-            state = advance(state, v[k], c, e, x)
+            state = advance(state, v[k], c, e, x, added)
         if e is not None:
             s = state
             state = State(s.i_a, s.omega, s.rotor_angle, s.theta, s.theta_dot, s.thrust, s.heat, s.flex, s.flex_dot,
-                          x.gust_decay * s.gust + x.gust_kick * noise[k])
+                          x.gust_decay * s.gust + x.gust_kick * noise[k], s.time, s.memory)
     return state
 
 
 @njit(nogil=True)
-def run_arm(speed: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
+def run_arm(speed: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, added: Terms | None,
+            out: Array) -> State:
     """Air and arm alone, for a given speed of the rotor, linear between samples.
 
     Args:
@@ -815,6 +1015,7 @@ def run_arm(speed: Array, state: State, c: Coefficients, e: Values | None, x: Ex
         c: coefficients.
         e: effects; None for the nominal plant.
         x: coefficients of the effects; None for the nominal plant.
+        added: terms by formula; None without any.
         out: (2, N), filled with θ, θ̇.
 
     Returns:
@@ -825,15 +1026,20 @@ def run_arm(speed: Array, state: State, c: Coefficients, e: Values | None, x: Ex
         w = speed[k]
         rise = (speed[min(k + 1, speed.shape[0] - 1)] - w) / c.steps
         for _ in range(c.steps):
-            now = State(0.0, w, 0.0, state.theta, state.theta_dot, state.thrust, 0.0, state.flex, state.flex_dot, 0.0)
-            m, f1 = advance_arm(now, w + 0.5 * rise, w + rise, c, e, x)
+            now = State(0.0, w, 0.0, state.theta, state.theta_dot, state.thrust, 0.0, state.flex, state.flex_dot, 0.0,
+                        state.time, state.memory)
+            past = None if added is None else pasts(now, 0.0, c, added)
+            m, f1 = advance_arm(now, w + 0.5 * rise, w + rise, past, c, e, x, added)
             w += rise
-            state = State(0.0, w, 0.0, m.theta, m.theta_dot, f1, 0.0, m.flex, m.flex_dot, 0.0)
+            state = State(0.0, w, 0.0, m.theta, m.theta_dot, f1, 0.0, m.flex, m.flex_dot, 0.0, now.time, now.memory)
+            if added is not None and past is not None:
+                state = since(state, past_after(now, state, 0.0, past, c, added))
     return state
 
 
 @njit(nogil=True)
-def run_motor(v: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, out: Array) -> State:
+def run_motor(v: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, added: Terms | None,
+              out: Array) -> State:
     """Winding and rotor alone, for a given voltage at the motor's terminals.
 
     Args:
@@ -842,6 +1048,7 @@ def run_motor(v: Array, state: State, c: Coefficients, e: Values | None, x: Extr
         c: coefficients.
         e: effects; None for the nominal plant.
         x: coefficients of the effects; None for the nominal plant.
+        added: terms by formula; None without any.
         out: (3, N), filled with i_a, ω, rotor angle.
 
     Returns:
@@ -850,8 +1057,12 @@ def run_motor(v: Array, state: State, c: Coefficients, e: Values | None, x: Extr
     for k in range(v.shape[0]):
         out[0, k], out[1, k], out[2, k] = state.i_a, state.omega, state.rotor_angle
         for _ in range(c.steps):
-            i1, _, w1, angle, heat = advance_motor(state, v[k], c, e, x)
-            state = State(i1, w1, angle, 0.0, 0.0, 0.0, heat, 0.0, 0.0, 0.0)
+            now = state
+            past = None if added is None else pasts(now, v[k], c, added)
+            i1, _, w1, angle, heat = advance_motor(now, v[k], past, c, e, x, added)
+            state = State(i1, w1, angle, 0.0, 0.0, 0.0, heat, 0.0, 0.0, 0.0, now.time, now.memory)
+            if added is not None and past is not None:
+                state = since(state, past_after(now, state, v[k], past, c, added))
     return state
 
 
@@ -873,8 +1084,8 @@ def simulate(model: Model, duty: Array, period: float = SAMPLE_PERIOD, state: St
     duty = np.ascontiguousarray(duty, dtype=float)
     v, sampled = actuator.voltages(model.numbers(), duty, model.effects, period, start)
     out = np.empty((7, len(duty)))
-    c, e, x = prepare(model, period)
-    run(v, np.zeros(len(duty)) if noise is None else noise, State() if state is None else state, c, e, x, out)
+    run(v, np.zeros(len(duty)) if noise is None else noise, State() if state is None else state,
+        *prepare(model, period), out)
     if "command_delay" in model.effects:
         out[ROW.v_a] += sampled - v
     return Trajectory(*out)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The catalogue of effects that a nominal model can lack: one entry per effect.
 
-To add one: an entry here, its term in `actuator.py`, `dynamics.py` or `sensing.py`, and its row in docs/effects.md.
+To add one: an entry here, its term in `actuator.py`, `dynamics.py` or `sensing.py`, and its row in docs/effects.md. An
+effect whose term is a formula needs no source: see `effect_file`.
 """
 
 from __future__ import annotations
@@ -59,6 +60,16 @@ class Effect:
 
     `product`: the size, and the size times the second; `polar`: the size times the cosine and the sine of the second.
     """
+    term: str = ""
+    """The formula of its term, for an effect that is given by one; see docs/effects.md for what it is added to."""
+    reading: str = ""
+    """The reading that the term is added to, for a formula at place `sensing`: `theta`, `i_a` or `v_a`."""
+    memory: str = ""
+    """Name of the state that such an effect has of its own; it is 0 at the start."""
+    memory_unit: str = ""
+    """Its unit."""
+    rate: str = ""
+    """The formula of the time derivative of that state."""
 
     @property
     def size(self) -> str:
@@ -135,6 +146,9 @@ _ENTRIES = (
 CATALOGUE: dict[str, Effect] = {entry.id: entry for entry in _ENTRIES}
 """All effects except `parameter_mismatch`, by id, in the order of the chain."""
 
+DEFINED: dict[str, Effect] = dict(CATALOGUE)
+"""The effects of the catalogue, and those that effect files and model files of this process have defined, by id."""
+
 RANDOM = frozenset({"gust", "speed_spikes"})
 """Effects of chance: no model predicts their readings, and no fit of readings has their parameters."""
 
@@ -147,6 +161,9 @@ _FIELDS = {f"{effect.id}_{name}": parameter.neutral
 Values = NamedTuple("Values", [(name, float) for name in _FIELDS])  # type: ignore[misc]
 """All parameters of the effects in the equations, as `<id>_<parameter>`, for `dynamics`."""
 
+NO_EFFECT = Values(**_FIELDS)
+"""All parameters neutral."""
+
 
 def is_active(effect_id: str, parameters: Mapping[str, float]) -> bool:
     """Whether an effect with these parameters differs from the nominal model.
@@ -155,7 +172,7 @@ def is_active(effect_id: str, parameters: Mapping[str, float]) -> bool:
         effect_id: its id.
         parameters: all of its parameters by name.
     """
-    effect = CATALOGUE[effect_id]
+    effect = DEFINED[effect_id]
     return parameters[effect.size] != effect.parameters[effect.size].neutral
 
 

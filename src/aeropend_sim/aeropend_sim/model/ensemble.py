@@ -15,6 +15,7 @@ from aeropend_sim.compiled import njit
 from aeropend_sim.model.dynamics import Coefficients, Lag, State, advance, equation, prepare, steps_in
 from aeropend_sim.model.effects import PARAMETER_MISMATCH, is_active
 from aeropend_sim.model.parameters import DUTY_MAP, SAMPLE_PERIOD, Model
+from aeropend_sim.model.terms import EMPTY
 
 Array = NDArray[np.float64]
 
@@ -83,13 +84,13 @@ def _coefficients(a: Array, j: int) -> Coefficients:
 def _state(a: Array, j: int) -> State:
     n = LANES
     return State(a[ROW.i_a * n + j], a[ROW.omega * n + j], 0.0, a[ROW.theta * n + j], a[ROW.theta_dot * n + j],
-                 a[ROW.thrust * n + j], 0.0, 0.0, 0.0, 0.0)
+                 a[ROW.thrust * n + j], 0.0, 0.0, 0.0, 0.0, 0.0, EMPTY)
 
 
 @equation
 def _advance_lane(a: Array, j: int, state: State, v: float) -> None:
     n = LANES
-    after = advance(state, v, _coefficients(a, j), None, None)
+    after = advance(state, v, _coefficients(a, j), None, None, None)
     a[ROW.i_a * n + j] = after.i_a
     a[ROW.omega * n + j] = after.omega
     a[ROW.theta * n + j] = after.theta

@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import difflib
 import os
-import re
 import tempfile
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -15,16 +14,19 @@ from pathlib import Path
 import yaml
 
 from aeropend_sim.errors import UserError
-from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
-from aeropend_sim.untrusted import load_yaml, printable
+from aeropend_sim.model import effect_file
+from aeropend_sim.model.effects import DEFINED, PARAMETER_MISMATCH
+from aeropend_sim.untrusted import NumberLoader, load_yaml, printable
 
 SAMPLE_PERIOD = 64 * 510 / 16e6
 """[s] Sample period: Timer1 of a 16 MHz ATmega2560, 8-bit phase-correct PWM, prescaler 64 (thesis 4.3.2)."""
 
 PRESETS = ("bench", "thesis")
 
-SECTIONS = ("model", "sensing", "effects")
-"""The sections of a model file. The parameters of a node may stand beside them."""
+SECTIONS = ("model", "sensing", "definitions", "effects")
+"""The sections of a model file. The parameters of a node may stand beside them.
+
+`definitions` has the effects that are given by a formula."""
 
 
 class ModelError(UserError):
@@ -123,7 +125,7 @@ class Model:
             id_: the effect's id in the catalogue.
             parameter: name of its parameter.
         """
-        return float(self.effects.get(id_, {}).get(parameter, CATALOGUE[id_].parameters[parameter].neutral))
+        return float(self.effects.get(id_, {}).get(parameter, DEFINED[id_].parameters[parameter].neutral))
 
     def with_effects(self, effects: Mapping[str, Mapping[str, float]]) -> Model:
         """The same model with other effects.
@@ -153,7 +155,7 @@ def from_flat(flat: Mapping[str, object], name: str = "model", base: Model | Non
     """Build a model from dotted names, e.g. `model.R_a`, `effects.coulomb_friction.accel`.
 
     Args:
-        flat: dotted name -> value. Missing parameters of an effect take the defaults of the catalogue.
+        flat: dotted name -> value. Missing parameters of an effect take its defaults.
         name: source of the values for error messages, usually the file.
         base: supplies the missing values. Without it all `model.*` and `sensing.*` names must be given.
 
@@ -166,7 +168,7 @@ def from_flat(flat: Mapping[str, object], name: str = "model", base: Model | Non
         numbers = {f"{section}.{key}": value for section in ("model", "sensing")
                    for key, value in getattr(base, section).items()}
         effects = {id_: dict(parameters) for id_, parameters in base.effects.items()}
-    for key, value in flat.items():
+    for key, value in with_definitions(flat, name).items():
         section, _, rest = key.partition(".")
         if key in SECTIONS:
             raise ModelError(f"{name}: '{key}' is {value!r}; give its parameters by name, one per line")
@@ -186,20 +188,48 @@ def from_flat(flat: Mapping[str, object], name: str = "model", base: Model | Non
                          "a model file gives all parameters that the presets give")
     for id_, parameters in effects.items():
         if id_ != PARAMETER_MISMATCH:
-            for key, q in CATALOGUE[id_].parameters.items():
+            for key, q in DEFINED[id_].parameters.items():
                 parameters.setdefault(key, q.default)
     return Model(name, {n: numbers[f"model.{n}"] for n in MODEL_NAMES},
                  {n: numbers[f"sensing.{n}"] for n in SENSING_NAMES}, effects)
 
 
+def with_definitions(flat: Mapping[str, object], name: str) -> dict[str, object]:
+    """Make the effects known that a model file defines.
+
+    Args:
+        flat: dotted name -> value.
+        name: source of the values for error messages.
+
+    Returns:
+        The values without the definitions.
+
+    Raises:
+        EffectError: a definition cannot be used.
+    """
+    tree: dict[str, object] = {}
+    for key, value in flat.items():
+        if key.startswith("definitions."):
+            _, *path, last = key.split(".")
+            inner = tree
+            for each in path:
+                inner = inner.setdefault(each, {})  # type: ignore[assignment]
+                if not isinstance(inner, dict):
+                    raise ModelError(f"{name}: {key} cannot be read; a definition has the form of an effect file")
+            inner[last] = value
+    if tree:
+        effect_file.define(tree, name)
+    return {key: value for key, value in flat.items() if not key.startswith("definitions.")}
+
+
 def _read_effect(effects: dict[str, dict[str, float]], rest: str, value: object, where: str) -> None:
     id_, _, parameter = rest.partition(".")
-    known = (*CATALOGUE, PARAMETER_MISMATCH)
+    known = (*DEFINED, PARAMETER_MISMATCH)
     if id_ not in known:
         raise _unknown("effect", id_, known, where)
     if not parameter:
         example = "R_a: 1.2" if id_ == PARAMETER_MISMATCH else (
-            f"{CATALOGUE[id_].size}: {CATALOGUE[id_].parameters[CATALOGUE[id_].size].default:g}")
+            f"{DEFINED[id_].size}: {DEFINED[id_].parameters[DEFINED[id_].size].default:g}")
         raise ModelError(f"{where}: effects.{id_} has no parameter; give at least one, as in {id_}: {{{example}}}")
     if id_ == PARAMETER_MISMATCH:
         key = f"model.{parameter}"
@@ -208,14 +238,14 @@ def _read_effect(effects: dict[str, dict[str, float]], rest: str, value: object,
         p = PARAMETERS[key]
         effects.setdefault(id_, {})[parameter] = _number(f"effects.{rest}", value, p.low, p.high, p.unit, where)
         return
-    if parameter not in CATALOGUE[id_].parameters:
-        raise _unknown(f"parameter of {id_}", parameter, tuple(CATALOGUE[id_].parameters), where)
-    q = CATALOGUE[id_].parameters[parameter]
+    if parameter not in DEFINED[id_].parameters:
+        raise _unknown(f"parameter of {id_}", parameter, tuple(DEFINED[id_].parameters), where)
+    q = DEFINED[id_].parameters[parameter]
     effects.setdefault(id_, {})[parameter] = _number(f"effects.{rest}", value, q.low, q.high, q.unit, where)
 
 
 def to_flat(model: Model) -> dict[str, float]:
-    """The inverse of `from_flat`: dotted name -> value."""
+    """The values of a model: dotted name -> value; `from_flat` reads them where its effects are defined."""
     flat = {f"model.{key}": value for key, value in _given(model).items()}
     flat.update({f"sensing.{key}": value for key, value in model.sensing.items()})
     flat.update({f"effects.{id_}.{key}": value
@@ -270,7 +300,7 @@ def read_flat(source: str | Path) -> dict[str, object]:
     """
     name, text = str(source), _text(source)
     try:
-        tree = load_yaml(text, _Loader)
+        tree = load_yaml(text, NumberLoader)
     except yaml.MarkedYAMLError as error:
         line = f" at line {error.problem_mark.line + 1}" if error.problem_mark else ""
         raise ModelError(f"{name}: not valid YAML{line}: {error.problem}; see the presets for the form") from None
@@ -290,28 +320,6 @@ def _text(source: str | Path) -> str:
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise ModelError(f"{source}: the model file cannot be read: {reason}") from None
-
-
-class _Loader(yaml.SafeLoader):
-    """Reads numbers as rcl does (1e-5 is a number, which is text in YAML 1.1), and refuses repeated keys."""
-
-    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 - PyYAML's own
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, object]:
-        seen: set[str] = set()
-        for key, _ in node.value:
-            name = str(key.value)
-            if name in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"{name} is given twice", key.start_mark)
-            seen.add(name)
-        return super().construct_mapping(node, deep)
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$"),
-    list("-+.0123456789"))
-_Loader.add_implicit_resolver("tag:yaml.org,2002:null", re.compile(r"~$|null$|Null$|NULL$|$"), ["~", "n", "N", ""])
 
 
 def _node_parameters(tree: object, name: str) -> dict[str, object]:
@@ -341,6 +349,8 @@ def save(model: Model, path: str | Path, comment: str = "") -> None:
         ModelError: the file cannot be written. An old file is then unchanged.
     """
     tree: dict[str, object] = {"model": _given(model), "sensing": dict(model.sensing)}
+    if defined := effect_file.definitions(model.effects):
+        tree["definitions"] = defined
     if model.effects:  # rcl's parser refuses an empty mapping
         tree["effects"] = {id_: dict(parameters) for id_, parameters in model.effects.items()}
     head = "".join(f"# {printable(line)}\n" for line in comment.splitlines())

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_sim.model import actuator, dynamics, sensing
+from aeropend_sim.model.effects import CATALOGUE, DEFINED
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 
 Array = NDArray[np.float64]
@@ -83,7 +84,10 @@ class Rig:
         truth, read = np.empty((7, n)), np.empty((4, n))
         self._state = dynamics.run(v, self._kicks.standard_normal(n), self._state, *self._plant, truth)
         truth[dynamics.ROW.v_a] += sampled - v
-        self._memory = sensing.read(read, truth, self._normal.standard_normal((n, 4)), self._uniform.random((n, 2)),
+        angle = sensing.seen_angle(self.model, truth[dynamics.ROW.theta], truth[dynamics.ROW.theta_dot], self.period,
+                                   self._count * self.period)
+        seen = _with_errors(self.model, truth, *angle)
+        self._memory = sensing.read(read, seen, self._normal.standard_normal((n, 4)), self._uniform.random((n, 2)),
                                     self._memory, self._count == 0, self._chain)
         self._count += n
         return read, truth
@@ -96,6 +100,19 @@ class Rig:
         """
         read, truth = self.run(np.array([duty]))
         return Sample(*read[:, 0].tolist()), Truth(*truth[:len(Truth._fields), 0].tolist())
+
+
+def _with_errors(model: Model, truth: Array, theta: Array, theta_dot: Array) -> Array:
+    """The states (7, N) as the sensors see them: with the errors of readings that are given by formulas."""
+    errors = {e.reading for id_ in model.effects if (e := DEFINED.get(id_)) is not None and e.reading}
+    if not errors:
+        return truth
+    seen, row = truth.copy(), dynamics.ROW
+    seen[row.theta], seen[row.theta_dot] = theta, theta_dot
+    alone = model.with_effects({id_: p for id_, p in model.effects.items() if id_ not in CATALOGUE})
+    seen[row.i_a] = sensing.read_current(alone, truth[row.i_a])
+    seen[row.v_a] = sensing.read_voltage(alone, truth[row.v_a])
+    return seen
 
 
 def record(model: Model, duty: Array, seed: int = 0, period: float = SAMPLE_PERIOD

@@ -17,10 +17,17 @@ from numpy.typing import NDArray
 
 from aeropend_sim.compiled import njit
 from aeropend_sim.model.dynamics import NO_LAG, ROW, Lag, lag
-from aeropend_sim.model.effects import SPIKE_FACTOR
+from aeropend_sim.model.effects import DEFINED, SPIKE_FACTOR
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+from aeropend_sim.model.terms import series
 
 Array = NDArray[np.float64]
+
+REPEATED = 20
+"""Rounds of the fixed point that takes the error out of a voltage. A choice: an error of 30 % falls to 1e-10."""
+
+AHEAD = 1e-4
+"""[s] Time over which the rate of an error of the angle is taken (a choice: far below a sample)."""
 
 SPEED_TIMEOUT = 0.5
 """[s] Time without a pulse after which the speed reads 0. Convention, as in the firmware (speed.h)."""
@@ -82,12 +89,13 @@ def read_current(model: Model, current: ScalarOrArray) -> ScalarOrArray:
     """Reading of a current before noise and quantisation.
 
     Args:
-        model: its effects `current_gain` and `current_offset` act.
+        model: its effects `current_gain` and `current_offset` act, and its effects by formula.
         current: [A] scalar or (N,) true current.
 
     Returns:
         [A] i (1 + gain) + bias, in the shape of `current`.
     """
+    current = current + _error(model, "i_a", i_a=current)
     return current * (1.0 + model.effect("current_gain", "gain")) + model.effect("current_offset", "bias")
 
 
@@ -95,13 +103,13 @@ def read_voltage(model: Model, voltage: ScalarOrArray) -> ScalarOrArray:
     """Reading of a voltage before noise and quantisation.
 
     Args:
-        model: its effect `voltage_offset` acts.
+        model: its effect `voltage_offset` acts, and its effects by formula.
         voltage: [V] scalar or (N,) true voltage at the motor's terminals.
 
     Returns:
         [V] v + bias, in the shape of `voltage`.
     """
-    return voltage + model.effect("voltage_offset", "bias")
+    return voltage + _error(model, "v_a", v=voltage) + model.effect("voltage_offset", "bias")
 
 
 def true_voltage(model: Model, reading: ScalarOrArray) -> ScalarOrArray:
@@ -114,7 +122,56 @@ def true_voltage(model: Model, reading: ScalarOrArray) -> ScalarOrArray:
     Returns:
         [V] v - bias, in the shape of `reading`.
     """
-    return reading - model.effect("voltage_offset", "bias")
+    first = reading - model.effect("voltage_offset", "bias")
+    true = first
+    for _ in range(REPEATED if any(DEFINED[id_].reading == "v_a" for id_ in model.effects if id_ in DEFINED) else 0):
+        true = first - _error(model, "v_a", v=true)
+    return true
+
+
+def _error(model: Model, channel: str, **known: ScalarOrArray) -> ScalarOrArray:
+    """The error of a reading that formulas give, in the shape of the quantity that it depends on; 0.0 without any."""
+    if not any(DEFINED[id_].reading == channel for id_ in model.effects if id_ in DEFINED):
+        return 0.0  # type: ignore[return-value]
+    (value,) = known.values()
+    found = series(model.effects, channel, np.size(value), 0.0, **{name: np.ravel(x) for name, x in known.items()})
+    return found.reshape(np.shape(value)) if np.ndim(value) else float(found[0])  # type: ignore[return-value]
+
+
+def seen_angle(model: Model, theta: Array, theta_dot: Array, period: float, start: float = 0.0) -> tuple[Array, Array]:
+    """Angle and rate that the encoder sees: the true ones, with the errors of the reading that are given by formulas.
+
+    Args:
+        model: its effects by formula act.
+        theta: (N,) [rad] true angle.
+        theta_dot: (N,) [rad/s] true rate.
+        period: [s] time between samples.
+        start: [s] time of the first sample.
+    """
+    if not any(DEFINED[id_].reading == "theta" for id_ in model.effects if id_ in DEFINED):
+        return theta, theta_dot
+
+    def error(ahead: float) -> Array:
+        t: Array = start + period * np.arange(len(theta), dtype=np.float64) + ahead
+        return series(model.effects, "theta", len(theta), period, theta=theta + ahead * theta_dot, theta_dot=theta_dot,
+                      t=t)
+
+    return theta + error(0.0), theta_dot + (error(AHEAD) - error(-AHEAD)) / (2.0 * AHEAD)
+
+
+def read_angle(model: Model, theta: Array, theta_dot: Array, period: float = SAMPLE_PERIOD) -> Array:
+    """Reading of the angle before noise and quantisation.
+
+    Args:
+        model: sensing parameters and effects.
+        theta: (N,) [rad] true angle.
+        theta_dot: (N,) [rad/s] true rate.
+        period: [s] time between samples.
+
+    Returns:
+        (N,) [rad] output of the encoder and its filter.
+    """
+    return angle_reading(*seen_angle(model, theta, theta_dot, period), prepare(model, period))
 
 
 def angle_filter_tau(model: Model) -> float:

@@ -28,16 +28,19 @@ from sensor_msgs.msg import BatteryState, JointState
 from std_srvs.srv import Trigger
 
 from aeropend_sim.errors import UserError
-from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
+from aeropend_sim.model import effect_file
+from aeropend_sim.model.effects import CATALOGUE, DEFINED, PARAMETER_MISMATCH
 from aeropend_sim.model.parameters import (
     MODEL_NAMES,
     PARAMETERS,
     PRESETS,
     SAMPLE_PERIOD,
+    SECTIONS,
     Model,
     from_flat,
     load,
     to_flat,
+    with_definitions,
 )
 from aeropend_sim.ros import interface
 from aeropend_sim.ros.diagnostics import Diagnostics
@@ -54,6 +57,7 @@ BACKLOG = 49
 
 SETTINGS = {
     "preset": Setting("bench", "model that supplies all parameters that are not set", choices=PRESETS),
+    "effect_file": Setting("", "file of effects by formula, which may then be set as effects.ID", path=True),
     "seed": Setting(0, "seed of noise and gusts", low=0, high=2**31 - 1),
     "speed": Setting(
         1.0, "simulated over real time; not 1: publishes /clock; 0: as fast as possible", low=0.0, high=1e3
@@ -67,8 +71,8 @@ def _setting(name: str) -> Setting:
     if section == "effects":
         effect, _, key = rest.partition(".")
         if effect != PARAMETER_MISMATCH:
-            q = CATALOGUE[effect].parameters[key]
-            return Setting(q.default, f"{CATALOGUE[effect].physics}: {q.description}", q.unit, q.low, q.high)
+            q = DEFINED[effect].parameters[key]
+            return Setting(q.default, f"{DEFINED[effect].physics}: {q.description}", q.unit, q.low, q.high)
         name = f"model.{key}"
     p = PARAMETERS[name]
     return Setting(p.low, p.description, p.unit, p.low, p.high)
@@ -278,9 +282,11 @@ def read_parameters(node: Node, given: dict[str, Any]) -> tuple[dict[str, Any], 
     Raises:
         UserError: unknown name, wrong type, or out of range.
     """
-    mine = {name: value for name, value in given.items() if name.split(".")[0] not in ("model", "sensing", "effects")}
+    mine = {name: value for name, value in given.items() if name.split(".")[0] not in SECTIONS}
     settings = read_settings(node, SETTINGS, mine)
-    flat = {name: value for name, value in given.items() if name not in mine}
+    if settings["effect_file"]:
+        effect_file.load(settings["effect_file"])
+    flat = with_definitions({name: value for name, value in given.items() if name not in mine}, "parameters")
     model = from_flat(_with_defaults(flat), "parameters", load(settings["preset"]))
     for name, value in to_flat(model).items():
         declare(node, name, value, _setting(name).descriptor())
@@ -291,10 +297,10 @@ def _with_defaults(flat: dict[str, Any]) -> dict[str, Any]:
     """Replace the empty values of a parameter file: `effects: {}`, and an effect without parameters."""
     resolved: dict[str, Any] = {}
     for name, value in flat.items():
-        effect = CATALOGUE.get(name.removeprefix("effects."))
+        effect = DEFINED.get(name.removeprefix("effects."))
         if value == "" and name.startswith("effects.") and effect is not None:
             resolved |= {f"{name}.{key}": parameter.default for key, parameter in effect.parameters.items()}
-        elif value == "" and name in ("model", "sensing", "effects"):
+        elif value == "" and name in SECTIONS:
             continue
         elif name == "effects":
             raise UserError(f"parameter effects is {value!r}: give effects by id, as effects: {{gust: {{sigma: 1.5}}}}")

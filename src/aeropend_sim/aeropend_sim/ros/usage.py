@@ -83,6 +83,7 @@ def usage(
             limits = f"{setting.low:.12g}..{setting.high:.12g}"
         unit = f" {setting.unit}" if setting.unit else ""
         default = str(setting.default).lower() if isinstance(setting.default, bool) else setting.default
+        default = "none" if default == "" else default
         limits = f"{limits}{unit}; " if limits else ""
         lines.append(f"  {name:<18} {setting.description}; {limits}default {default}")
     lines += ["", more] if more else []

@@ -18,7 +18,7 @@ from aeropend_ident.diagnosis.policy import UNCALIBRATED, Policy
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import dynamics
-from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.effects import DEFINED
 from aeropend_sim.model.parameters import Model
 
 Array = NDArray[np.float64]
@@ -53,7 +53,7 @@ class CachedChain(CutChain):
 def _acts_on_motor(name: str) -> bool:
     owner = key(name).owner
     return name not in BEHIND_MOTOR and owner != "sensing" and not (
-        owner in CATALOGUE and CATALOGUE[owner].place == "arm")
+        owner in DEFINED and DEFINED[owner].place == "arm")
 
 
 class CachedChains(CutChains):

@@ -108,7 +108,7 @@ class CutChain:
             # the duty before the recording is taken from the first voltage: with a delay it acts for a while
             first = s.v_a[0] if np.isfinite(s.v_a[0]) else actuator.voltage_at(n, values.get("initial.omega", 0.0))
             v = of(n, s.duty, m.effects, s.period, start=-piece.start, before=float(actuator.duty(n, first)))
-            out[piece] = sensing.read_voltage(m, actuator.terminal_voltage(m, v[piece], self.current[piece]))
+            out[piece] = sensing.read_voltage(m, actuator.terminal_voltage(m, v[piece], self.current[piece], s.period))
         return out
 
     def actuator_residuals(self, values: Values) -> dict[str, Array]:
@@ -168,8 +168,7 @@ class CutChain:
             voltage = self._motor_input(values) if DELAY in values else self.voltage
         out = np.empty((3, len(voltage[:stop])))
         for piece, whole in self.pieces(values, stop):
-            # the supply acts before the terminals: the measured voltage holds its sag
-            m = whole.with_effects({k: p for k, p in whole.effects.items() if k != "supply_sag"})
+            m = actuator.behind_terminals(whole)
             true = sensing.true_voltage(m, voltage[piece])
             part = np.empty((3, len(true)))
             state = dynamics.run_motor(true, state, *dynamics.prepare(m, self.signals.period), part)
@@ -215,7 +214,7 @@ class CutChain:
         theta, rate = self.arm_motion(values, stop)
         s, out = self.signals, np.empty(len(theta))
         for piece, m in self.pieces(values, stop):
-            out[piece] = sensing.angle_reading(theta, rate, sensing.prepare(m, s.period))[piece]
+            out[piece] = sensing.read_angle(m, theta, rate, s.period)[piece]
         return out
 
     def arm_motion(self, values: Values, stop: int | None = None) -> tuple[Array, Array]:
@@ -268,6 +267,7 @@ class CutChains:
         self.likely: Mapping[str, float] = {}  # sizes of effects with which the parameters were identified
         self.plain: Model | None = None  # the best nominal model without further terms, of a driven rig
         self.known: Known | None = None  # what earlier verdicts know of the rig
+        self.further: tuple[str, ...] = ()  # ids of effects of effect files that are tried too
         self.notes: tuple[str, ...] = ()  # what the recordings do not tell of the nominal model of a driven rig
         self.each = [self._cut(signals) for signals in recordings]
 

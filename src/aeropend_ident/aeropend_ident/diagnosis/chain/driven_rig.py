@@ -36,7 +36,7 @@ from aeropend_ident.estimation.map_fit import ENOUGH, Fit, Search, Sensitivities
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import actuator, dynamics
-from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.effects import DEFINED
 from aeropend_sim.model.parameters import Model
 
 Array = NDArray[np.float64]
@@ -107,8 +107,8 @@ class Units:
         numbers = {n: v * t ** POWER_OF.get(n, 0) for n, v in m.model.items()}
         numbers["k2"] = m.model["k2"] / u
         tau = key(FILTER).name
-        effects = {e: {n: v * t ** POWERS.get(CATALOGUE[e].parameters[n].unit, 0) for n, v in p.items()}
-                   if e in CATALOGUE else dict(p) for e, p in m.effects.items()}
+        effects = {e: {n: v * t ** POWERS.get(DEFINED[e].parameters[n].unit, 0) for n, v in p.items()}
+                   if e in DEFINED else dict(p) for e, p in m.effects.items()}
         return Model(m.name, numbers, {**m.sensing, tau: m.sensing[tau] * t}, effects)
 
 
@@ -267,7 +267,7 @@ def _refined(model: Model, best: Candidate, recordings: Sequence[Signals], keep:
     """
     for name in filter(refines, CHOSEN):
         owner = key(name).owner
-        terms = [f"{owner}.{CATALOGUE[owner].size}", name]
+        terms = [f"{owner}.{DEFINED[owner].size}", name]
         if owner in keep:
             continue
         tried = _candidate(_with_terms(best.model, terms), recordings)
@@ -315,7 +315,7 @@ def _delay_or_lag(best: Candidate, recordings: Sequence[Signals], keep: Collecti
 
 def _without(c: Candidate, recordings: Sequence[Signals], name: str) -> Candidate:
     k = key(name)
-    effects = {e: p for e, p in c.model.effects.items() if e != k.owner or CATALOGUE[e].size != k.name}
+    effects = {e: p for e, p in c.model.effects.items() if e != k.owner or DEFINED[e].size != k.name}
     if k.owner in effects:
         effects[k.owner] = {**effects[k.owner], k.name: absent_at(name)}
     return _candidate(c.model.with_effects(effects), recordings)

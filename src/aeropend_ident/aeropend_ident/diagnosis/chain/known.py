@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.values import FILTER, PLACE_OF_PARAMETER, STAGES, limits
 from aeropend_ident.estimation.parameter import Parameter, key
-from aeropend_sim.model.effects import CATALOGUE, RANDOM
+from aeropend_sim.model.effects import DEFINED, RANDOM
 
 Array = NDArray[np.float64]
 
@@ -69,8 +69,8 @@ class Known:
 def is_parameter(name: str) -> bool:
     """Whether it names a parameter of the model, the filter of the measurement chain, or a parameter of an effect."""
     k = key(name)
-    if k.owner in CATALOGUE:
-        return k.name in CATALOGUE[k.owner].parameters and k.plain == name
+    if k.owner in DEFINED:
+        return k.name in DEFINED[k.owner].parameters and k.plain == name
     return name in PLACE_OF_PARAMETER
 
 
@@ -79,7 +79,7 @@ def stage_of(name: str) -> str:
     owner = key(name).owner
     if name == FILTER:
         return "arm"
-    place = CATALOGUE[owner].place if owner in CATALOGUE else PLACE_OF_PARAMETER[name]
+    place = DEFINED[owner].place if owner in DEFINED else PLACE_OF_PARAMETER[name]
     if place == "sensing":
         return SENSED.get(owner, "arm")
     return next((stage for stage, places in PLACES_OF.items() if place in places), "arm")

@@ -15,7 +15,7 @@ from aeropend_ident.diagnosis.policy import angle_only, free_swinging
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.signals import STILL, Signals
 from aeropend_sim.model import actuator
-from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.effects import DEFINED
 from aeropend_sim.model.parameters import PARAMETERS, Model
 
 NOMINAL_SD = 0.03
@@ -216,7 +216,7 @@ def _of_angle(model: Model, recordings: Sequence[Signals]) -> list[Parameter]:
 
 def absent(parameters: Sequence[Parameter]) -> dict[str, float]:
     """The sizes at which effects among the parameters are absent, by name."""
-    return {key(p.name).plain: absent_at(p.name) for p in parameters if key(p.name).owner in CATALOGUE}
+    return {key(p.name).plain: absent_at(p.name) for p in parameters if key(p.name).owner in DEFINED}
 
 
 def held(model: Model) -> list[str]:
@@ -227,12 +227,12 @@ def held(model: Model) -> list[str]:
 
 def refines(name: str) -> bool:
     """Whether a parameter of an effect refines it."""
-    return CATALOGUE[key(name).owner].parameters[key(name).name].refines
+    return DEFINED[key(name).owner].parameters[key(name).name].refines
 
 
 def _of_effect(name: str, model: Model) -> Parameter:
     """The size of an effect that the nominal model holds, or what refines it."""
-    size = CATALOGUE[key(name).owner].parameters[key(name).name]
+    size = DEFINED[key(name).owner].parameters[key(name).name]
     if size.refines:
         start = model.effect(key(name).owner, key(name).name)
         return Parameter(name, size.neutral, RATIO_SD, size.low, size.high, start, log=True)
@@ -253,7 +253,7 @@ def usual_size(id_: str, model: Model) -> float:
         id_: of the effect.
         model: the nominal model of the rig.
     """
-    size = CATALOGUE[id_].parameters[CATALOGUE[id_].size]
+    size = DEFINED[id_].parameters[DEFINED[id_].size]
     return size.neutral + (size.default - size.neutral) * slowness(model) ** POWERS.get(size.unit, 0)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from aeropend_ident.estimation.parameter import key
-from aeropend_sim.model.effects import CATALOGUE, EffectParameter
+from aeropend_sim.model.effects import DEFINED, EffectParameter
 from aeropend_sim.model.parameters import DUTY_MAP, OPTIONAL, PARAMETERS, Model
 from aeropend_sim.model.parameters import Parameter as ModelParameter
 
@@ -63,12 +63,12 @@ def with_values(model: Model, values: Values) -> Model:
 
 def without_effects(values: Values, model: Model) -> dict[str, float]:
     """The values without those of effects that the model lacks."""
-    return {n: v for n, v in values.items() if key(n).owner not in CATALOGUE or key(n).owner in model.effects}
+    return {n: v for n, v in values.items() if key(n).owner not in DEFINED or key(n).owner in model.effects}
 
 
 def absent_at(name: str) -> float:
     """The value of a parameter of an effect at which the effect is absent."""
-    return CATALOGUE[key(name).owner].parameters[key(name).name].neutral
+    return DEFINED[key(name).owner].parameters[key(name).name].neutral
 
 
 def neutral(model: Model, name: str) -> float:
@@ -82,7 +82,7 @@ def neutral(model: Model, name: str) -> float:
 def limits(name: str) -> EffectParameter | ModelParameter:
     """The limits of a parameter of the model, of the measurement chain or of an effect."""
     k = key(name)
-    return CATALOGUE[k.owner].parameters[k.name] if k.owner in CATALOGUE else PARAMETERS[
+    return DEFINED[k.owner].parameters[k.name] if k.owner in DEFINED else PARAMETERS[
         name if k.owner else f"model.{name}"]
 
 

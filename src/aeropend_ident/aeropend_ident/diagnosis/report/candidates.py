@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from aeropend_ident.diagnosis.document import CANNOT_TELL, Candidate, DiagnosisDocument, Interval, NextExperiment
 from aeropend_ident.diagnosis.report.number_format import interval, minus, percent, probability, with_unit
 from aeropend_ident.diagnosis.report.sentence import NONE, SAME_END
-from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
+from aeropend_sim.model.effects import DEFINED, PARAMETER_MISMATCH
 from aeropend_sim.model.parameters import PARAMETERS
 
 PROBABLE = 0.01
@@ -109,7 +109,7 @@ def unit_of(effect: str, parameter: str) -> str:
     """
     if effect == PARAMETER_MISMATCH:
         return PARAMETERS[f"model.{parameter}"].unit
-    return CATALOGUE[effect].parameters[parameter].unit
+    return DEFINED[effect].parameters[parameter].unit
 
 
 def share_text(share: Interval) -> str:
@@ -185,7 +185,7 @@ def _row(document: DiagnosisDocument, c: Candidate) -> CandidateRow:
         value, between = interval(q.value, q.low, q.high)
         estimates.append(Estimate(name, with_unit(value, unit_of(c.effect, name)), between))
     physics = minus(f"{PARAMETERS[f'model.{parameter}'].description}; its value is off" if parameter
-                    else CATALOGUE[c.effect].physics)
+                    else DEFINED[c.effect].physics)
     return CandidateRow(c.effect, parameter, c.place, physics, c.probability, estimates, c.gap_after,
                         _closes(document, c), c.found, share_text(c.share) if c.share else "", why_lost(document, c),
                         _when(c))
@@ -204,7 +204,7 @@ def _at_an_end(c: Candidate) -> list[str]:
     """The parameters of an effect that are at an end of their range, apart from the value without the effect."""
     if c.effect == PARAMETER_MISMATCH:
         return []
-    known = CATALOGUE[c.effect].parameters
+    known = DEFINED[c.effect].parameters
     return [name for name, q in c.parameters.items() for end in (known[name].low, known[name].high)
             if end != known[name].neutral and abs(q.value - end) <= AT_END * abs(end)]
 

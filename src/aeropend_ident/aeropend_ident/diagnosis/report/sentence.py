@@ -10,7 +10,7 @@ from typing import Literal
 from aeropend_ident.diagnosis.document import CANNOT_TELL, ClosedGap, Closure, DiagnosisDocument, Since
 from aeropend_ident.diagnosis.policy import GOOD_ENOUGH
 from aeropend_ident.diagnosis.report.number_format import percent, quantity
-from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH, RANDOM
+from aeropend_sim.model.effects import DEFINED, PARAMETER_MISMATCH, RANDOM
 from aeropend_sim.model.parameters import PARAMETERS
 
 CLOSED = 0.9
@@ -121,7 +121,7 @@ def _claim(effects: Sequence[str], parameters: Sequence[str], *, complete: bool)
     if parameters:
         return [*sentence, Part(", and "), *listed(parameters), Part(off)]
     if len(effects) == 1 and complete:
-        return [*sentence, Part(f": {CATALOGUE[effects[0]].physics.partition(': ')[0]}")]
+        return [*sentence, Part(f": {DEFINED[effects[0]].physics.partition(': ')[0]}")]
     return sentence
 
 

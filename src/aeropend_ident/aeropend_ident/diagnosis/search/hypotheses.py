@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import qmc
 
 from aeropend_ident.diagnosis.chain.chain import DELAY, CutChains
 from aeropend_ident.diagnosis.chain.known import Known
@@ -22,7 +23,7 @@ from aeropend_ident.diagnosis.chain.priors import (
 from aeropend_ident.diagnosis.chain.values import FEWEST_PARAMETERS, PLACE_OF_PARAMETER, STAGES, limits
 from aeropend_ident.diagnosis.policy import angle_only
 from aeropend_ident.estimation.parameter import Parameter, key
-from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH, RANDOM
+from aeropend_sim.model.effects import CATALOGUE, DEFINED, PARAMETER_MISMATCH, RANDOM, EffectParameter
 from aeropend_sim.model.parameters import Model
 
 MISMATCH_SD = 0.3
@@ -56,6 +57,9 @@ TOGETHER = {("mgd_over_J", "L_over_J", "c_over_J"): "a mass put on the arm, or t
             ("k_load", "J_m"): "another propeller changes these together"}
 """Parameters that change together, and what a person has done then."""
 
+SCATTERED = 32
+"""Further start points of an effect by formula (choice: a twentieth of the range of two parameters is met)."""
+
 SAME = 1e-6
 """Change of a residual, in units of a reading's noise, that is rounding (choice).
 
@@ -86,7 +90,7 @@ class Hypothesis:
     @property
     def place(self) -> str:
         """Its place in the chain."""
-        return PLACE_OF_PARAMETER[self.parameter] if self.parameter else CATALOGUE[self.effect].place
+        return PLACE_OF_PARAMETER[self.parameter] if self.parameter else DEFINED[self.effect].place
 
     @property
     def own(self) -> tuple[Parameter, ...]:
@@ -99,15 +103,18 @@ class Hypothesis:
         return math.log(EFFECT_ODDS / (FEWEST_PARAMETERS if self.parameter else 1))
 
 
-def hypotheses(model: Model, *, mismatches: bool = True, known: Known | None = None) -> list[Hypothesis]:
-    """Every effect of the catalogue that the model lacks.
+def hypotheses(model: Model, further: Sequence[str] = (), *, mismatches: bool = True, known: Known | None = None
+               ) -> list[Hypothesis]:
+    """Every effect that the model lacks: of the catalogue, and of effect files.
 
     Args:
         model: the nominal model.
+        further: ids of effects of effect files.
         mismatches: whether each parameter of the model may be far off, too.
         known: what earlier verdicts know; parameters and effects that they have determined may have changed.
     """
-    all_ = [Hypothesis(id_, starts=tuple(_starts(id_, model))) for id_ in CATALOGUE if id_ not in model.effects]
+    all_ = [Hypothesis(id_, starts=tuple(_starts(id_, model))) for id_ in (*CATALOGUE, *further)
+            if id_ not in model.effects]
     if known is not None:
         return [*all_, *_changes(model, known)]
     if not mismatches:
@@ -138,18 +145,18 @@ def _changes(model: Model, known: Known) -> Iterable[Hypothesis]:
         if all(name in numbers for name in names):
             yield Hypothesis(PARAMETER_MISMATCH, names[0], (tuple(numbers[name] for name in names),))
     for id_, parameters in model.effects.items():
-        if id_ in CATALOGUE and id_ not in RANDOM and f"{id_}.{CATALOGUE[id_].size}" in known.names:
-            size = CATALOGUE[id_].parameters[CATALOGUE[id_].size]
-            was = parameters[CATALOGUE[id_].size]
+        if id_ in DEFINED and id_ not in RANDOM and f"{id_}.{DEFINED[id_].size}" in known.names:
+            size = DEFINED[id_].parameters[DEFINED[id_].size]
+            was = parameters[DEFINED[id_].size]
             wide = max(abs(was - size.neutral), abs(usual_size(id_, model) - size.neutral))
-            own = Parameter(f"{id_}.{CATALOGUE[id_].size}", was, wide, size.low, size.high,
+            own = Parameter(f"{id_}.{DEFINED[id_].size}", was, wide, size.low, size.high,
                             start=was + FIRST_SIZE * wide)
             yield Hypothesis(id_, starts=((own,),))
 
 
 def _starts(id_: str, model: Model) -> Iterable[tuple[Parameter, ...]]:
     """Start points for an effect: a third of its usual size, each other parameter at several places of its range."""
-    effect = CATALOGUE[id_]
+    effect = DEFINED[id_]
     size = effect.parameters[effect.size]
     step = usual_size(id_, model) - size.neutral
     head = Parameter(f"{id_}.{effect.size}", size.neutral, SIZE_SD * abs(step), size.low, size.high,
@@ -159,6 +166,8 @@ def _starts(id_: str, model: Model) -> Iterable[tuple[Parameter, ...]]:
     others = [(name, p) for name, p in effect.parameters.items() if name != effect.size and not p.refines]
     if not others:
         return [(head,)]
+    if effect.term:
+        return _scattered(id_, head, others)
     grids: list[list[Parameter]] = []
     for name, p in others:
         full = f"{id_}.{name}"
@@ -174,13 +183,31 @@ def _starts(id_: str, model: Model) -> Iterable[tuple[Parameter, ...]]:
     return [(head, first, *(g[len(g) // 2] for g in grids[1:])) for first in grids[0]]
 
 
+def _scattered(id_: str, head: Parameter, others: Sequence[tuple[str, EffectParameter]]
+               ) -> list[tuple[Parameter, ...]]:
+    """Start points of an effect by formula: at its defaults, and evenly over the ranges of its other parameters."""
+    points = np.vstack([np.full(len(others), math.nan), qmc.Sobol(len(others), seed=0).random(SCATTERED)])
+    return [(head, *(_somewhere(f"{id_}.{name}", p, share) for (name, p), share in zip(others, point, strict=True)))
+            for point in points.tolist()]
+
+
+def _somewhere(name: str, p: EffectParameter, share: float) -> Parameter:
+    """A parameter with a start at a share of its range, on a scale of ratios if it is positive; at its default: NaN."""
+    if p.low > 0.0:
+        spread = math.log(p.high / p.low)
+        start = p.default if math.isnan(share) else p.low * math.exp(share * spread)
+        return Parameter(name, p.default, 0.3 * spread, p.low, p.high, start, log=True)
+    start = p.default if math.isnan(share) else p.low + share * (p.high - p.low)
+    return Parameter(name, 0.5 * (p.low + p.high), 0.5 * (p.high - p.low), p.low, p.high, start)
+
+
 def stages_of(chains: CutChains, hypothesis: Hypothesis) -> tuple[str, ...]:
     """The stages whose residuals a hypothesis changes, found by trying it."""
     values: dict[str, float]
     if hypothesis.parameter:
         values = {hypothesis.parameter: 1.2 * chains.model.model[hypothesis.parameter]}
     else:
-        values = {f"{hypothesis.effect}.{k}": p.default for k, p in CATALOGUE[hypothesis.effect].parameters.items()}
+        values = {f"{hypothesis.effect}.{k}": p.default for k, p in DEFINED[hypothesis.effect].parameters.items()}
     guess = not chains.policy.calibrated
     changed = []
     for stage in STAGES:
@@ -227,8 +254,8 @@ def as_identified(chains: CutChains, hypothesis: Hypothesis) -> Hypothesis:
 
 def linear_parameters(id_: str) -> list[Parameter]:
     """Two parameters in which an effect is linear, in place of its size and second parameter; both 0 without it."""
-    size, second = list(CATALOGUE[id_].parameters.values())[:2]
-    if CATALOGUE[id_].linear_in == "polar":
+    size, second = list(DEFINED[id_].parameters.values())[:2]
+    if DEFINED[id_].linear_in == "polar":
         return [Parameter(f"{id_}.cosine", 0.0, SIZE_SD * size.default),
                 Parameter(f"{id_}.sine", 0.0, SIZE_SD * size.default)]
     return [Parameter(f"{id_}.slope", 0.0, SIZE_SD * size.default, size.low, size.high),
@@ -237,9 +264,9 @@ def linear_parameters(id_: str) -> list[Parameter]:
 
 def from_linear(id_: str, values: Mapping[str, float]) -> dict[str, float]:
     """Values with those of `linear_parameters` turned into the effect's own parameters."""
-    (size_name, size), (second_name, _) = list(CATALOGUE[id_].parameters.items())[:2]
+    (size_name, size), (second_name, _) = list(DEFINED[id_].parameters.items())[:2]
     own = dict(values)
-    if CATALOGUE[id_].linear_in == "polar":
+    if DEFINED[id_].linear_in == "polar":
         x, y = own.pop(f"{id_}.cosine"), own.pop(f"{id_}.sine")
         pair = math.hypot(x, y), math.atan2(y, x)
     else:

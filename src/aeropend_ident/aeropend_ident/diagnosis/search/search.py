@@ -93,8 +93,8 @@ def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], No
     """
     findings: dict[str, Findings] = {}
     calibrated, known = chains.policy.calibrated, chains.known
-    everything = [as_identified(chains, h) for h in hypotheses(chains.model, mismatches=calibrated, known=known)
-                  if not is_decided(chains, h)]
+    all_ = hypotheses(chains.model, chains.further, mismatches=calibrated, known=known)
+    everything = [as_identified(chains, h) for h in all_ if not is_decided(chains, h)]
     acts_on = {h.name: stages_of(chains, h) for h in everything}
     carried: dict[str, Parameter] = {}
     with ThreadPoolExecutor(jobs) as pool:

@@ -28,7 +28,7 @@ from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess, screen
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.signals import CHANNELS
 from aeropend_ident.signals.statistics import effective_sample_size
-from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.effects import DEFINED
 
 SHORTLIST = 8
 """Hypotheses that are fitted after the screening (choice: a third of the catalogue).
@@ -176,7 +176,7 @@ class SelectionRound:
         rounds = self.chains.policy.screening_rounds
 
         def again(h: Hypothesis) -> list[Future[Fit]]:
-            one = len(h.starts) == 1 or CATALOGUE[h.effect].linear_in
+            one = len(h.starts) == 1 or DEFINED[h.effect].linear_in
             return [] if one else [self._submit(h, rounds, start) for start in range(len(h.starts))]
 
         likeliest = [h for _, h, _ in self._likeliest(tried)[:CONTENDERS]]
@@ -323,7 +323,7 @@ class SelectionRound:
             begun = self.current.values
         if begun is None and hypothesis.begun:
             begun = {**self.current.values, **dict(hypothesis.begun)}
-        if begun is None and CATALOGUE[hypothesis.effect].linear_in:
+        if begun is None and DEFINED[hypothesis.effect].linear_in:
             first = fit(lambda values: residuals(from_linear(hypothesis.effect, values)),
                         [*known, *linear_parameters(hypothesis.effect)], rounds=3, least_ess=least)
             begun = self._within_range(hypothesis.effect, from_linear(hypothesis.effect, first.values))
@@ -336,9 +336,9 @@ class SelectionRound:
 
         For an uncalibrated rig only the product may be certain: a search that starts at a bound would stay there.
         """
-        size, second = (f"{effect}.{name}" for name in list(CATALOGUE[effect].parameters)[:2])
-        bounds = CATALOGUE[effect].parameters[key(second).name]
-        inside = not self.chains.policy.calibrated and CATALOGUE[effect].linear_in == "product"
+        size, second = (f"{effect}.{name}" for name in list(DEFINED[effect].parameters)[:2])
+        bounds = DEFINED[effect].parameters[key(second).name]
+        inside = not self.chains.policy.calibrated and DEFINED[effect].linear_in == "product"
         reach = INSIDE if inside else 1.0
         own[size] *= max(1.0, own[second] / (reach * bounds.high), own[second] / (reach * bounds.low))
         if inside:
