@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -49,6 +50,7 @@ from aeropend_ident.diagnosis.policy import GOOD_ENOUGH, MATERIAL_SHARE, angle_o
 from aeropend_ident.diagnosis.search import gust, onset, speed_spikes, unknown_effect
 from aeropend_ident.diagnosis.search.findings import Findings
 from aeropend_ident.diagnosis.search.free_curves import MissingTerm, Repeatable
+from aeropend_ident.diagnosis.search.learned_term import Learned, learn
 from aeropend_ident.diagnosis.search.onset import Onset
 from aeropend_ident.diagnosis.search.search import refit, search, trifling_gap, unsearched
 from aeropend_ident.diagnosis.search.unknown_effect import UnknownEffect
@@ -170,6 +172,7 @@ class _Findings:
         recordings: with the notes of the search.
         failed: why the nominal model could not be identified; "" if it was.
         onset: when the effects begin or end; None: they act all the time.
+        learned: the term that is learned in place of the unknown effect.
     """
 
     chains: CutChains
@@ -180,6 +183,7 @@ class _Findings:
     recordings: Sequence[Signals]
     failed: str = ""
     onset: Onset | None = None
+    learned: Learned | None = None
 
 
 @dataclass(frozen=True)
@@ -241,6 +245,9 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
         stages = {**found.stages, stage: found.stages[stage].nothing()}
         found, joint, gaps = _fit_and_measure(fitted, replace(found, stages=stages), progress)
         parts = _parts(found, joint, gaps, settings.jobs)
+    if found.unknown is not None and gap_share.headline(
+            parts, gap_share.shares(parts), settings.material).verdict == gap_share.UNKNOWN:
+        found, joint, gaps, parts = _with_learned_term(fitted, found, joint, gaps, parts, settings, progress)
     conclusions = _conclude(found, joint, gaps, parts, settings)
     model, chains = found.chains.model, found.chains
     nominal = model if chains.policy.calibrated else with_values(model, of_rig(gaps.base))
@@ -302,6 +309,25 @@ def _without_harmful(fitted: CutChains, found: _Findings, joint: JointFit, gaps:
         found, joint, gaps = without
         parts = _parts(found, joint, gaps, settings.jobs)
     return found, joint, gaps, parts
+
+
+def _with_learned_term(fitted: CutChains, found: _Findings, joint: JointFit, gaps: _Gaps, parts: list[Part],
+                       settings: Settings, progress: Progress) -> tuple[_Findings, JointFit, _Gaps, list[Part]]:
+    """Learn the term that the unknown effect adds, and measure again; nothing changes where it does not help."""
+    assert found.unknown is not None
+    progress("learning the missing term", 0.92)
+    unknown = found.unknown
+    with ThreadPoolExecutor(settings.jobs) as pool:
+        learned = learn(found.chains, joint.findings[unknown.stage], unknown.term.place, pool)
+    if learned is None:
+        return found, joint, gaps, parts
+    stages = {**found.stages, unknown.stage: learned.findings}
+    placed = replace(unknown, term=replace(unknown.term, place=learned.place))
+    with_ = replace(found, stages=stages, unknown=placed, learned=learned)
+    with_, joint_with, gaps_with = _fit_and_measure(fitted, with_, progress)
+    if gaps_with.after.total >= gaps.after.total:
+        return found, joint, gaps, parts
+    return with_, joint_with, gaps_with, _parts(with_, joint_with, gaps_with, settings.jobs)
 
 
 def _without(found: _Findings, name: str) -> _Findings:
@@ -402,10 +428,12 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
         failed = failed or gap_share.why_unsure(share, settings.material)
     if failed:
         head = gap_share.Headline(CANNOT_TELL, "none", [], [], set())
-    candidates = conclude.candidates(joint, found.statistical, gaps.held_out, gaps.after.total, head.claimed, share,
-                                     found.onset)
+    candidates = tuple(c for c in conclude.candidates(joint, found.statistical, gaps.held_out, gaps.after.total,
+                                                      head.claimed, share, found.onset)
+                       if found.learned is None or c.effect != found.learned.id)
+    unlearned = {} if found.learned is None else {found.learned.without.stage: found.learned.without}
     reasons = [f"{c} is off by {times(x)} a reading's noise"
-               for c, x in _left(stages, gust=found.statistical.gust is not None).items() if x > GOOD_ENOUGH]
+               for c, x in _left({**stages, **unlearned}, gust=found.statistical.gust is not None).items() if x > GOOD_ENOUGH]
     reasons = [failed] if failed else reasons
     undecided = conclude.not_separable(chains, stages)
     tried = EXPERIMENTS if calibrated else experiments_within(max(s.largest_duty for s in found.recordings))
@@ -419,7 +447,7 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
         which=Which(head.verdict, tuple(head.effects), candidates, rows,
                     {channel: Residual(check.rms[channel], check.white[channel], check.dependence)
                      for check in joint.checks.values() for channel in check.rms},
-                    tuple(reasons), None if unknown is None else _curves(unknown.term),
+                    tuple(reasons), None if unknown is None else _drawn(unknown.term, found.learned, joint, gaps),
                     tuple(conclude.names(a, b) for a, b in undecided),
                     conclude.next_experiment(chains.model, found.recordings[0], undecided, joint.values, tried,
                                              settings.jobs),
@@ -444,9 +472,19 @@ def _why_not_predicted(chains: CutChains, gaps: _Gaps) -> str:
             "a longer recording whose last third repeats angles and duties of the part before helps most")
 
 
-def _curves(term: MissingTerm) -> DrawnEffect:
-    return DrawnEffect(term.place, tuple(
-        Curve(c.variable, c.unit, tuple(c.knot.tolist()), tuple(c.value.tolist())) for c in term.curves))
+def _drawn(term: MissingTerm, learned: Learned | None, joint: JointFit, gaps: _Gaps) -> DrawnEffect:
+    """The unknown effect by the curves of the term that was learned; by free curves if none was."""
+    if learned is None:
+        return DrawnEffect(term.place, tuple(
+            Curve(c.variable, c.unit, tuple(c.knot.tolist()), tuple(c.value.tolist())) for c in term.curves))
+    share = gap_share.shares(gap_share.parts_of_effects(joint, gaps.held_out.in_motion()))
+    curves = tuple(Curve(f"{c.form.of}{FACTORS[c.form.factor]}", c.form.value_unit, tuple(c.knot.tolist()),
+                         tuple(learned.values_of(c, joint.values))) for c in learned.curves)
+    return DrawnEffect(learned.place, curves, learned.id, share.get(learned.id))
+
+
+FACTORS = {"": "", "thrust": " (share of the thrust)", "theta_dot": " (damping)", "i_a": " (resistance)"}
+"""What the values of a curve are that is multiplied by a quantity."""
 
 
 def _parts(found: _Findings, joint: JointFit, gaps: _Gaps, jobs: int) -> list[Part]:
@@ -459,6 +497,11 @@ def _parts(found: _Findings, joint: JointFit, gaps: _Gaps, jobs: int) -> list[Pa
         share = 1.0 if found.chains.policy.calibrated else gaps.repeats.of_stage(found.unknown.stage).share
         unknown = Repeatable(found.unknown.term.place, share)
     parts += gap_share.unexplained(held_out.gap(gaps.runs_after), gaps.floors, statistical.gust, unknown)
+    if (learned := found.learned) is not None:  # what it closes, and what it leaves, is of the unknown effect
+        its = [p for p in parts if p.name in (learned.id, gap_share.UNKNOWN)]
+        one = Part(gap_share.UNKNOWN, learned.place, sum(max(p.amount, 0.0) for p in its),
+                   np.sum([p.windows for p in its], axis=0))
+        parts = [*(p for p in parts if all(p is not q for q in its)), one]
     if statistical.spikes is not None:  # they are few: the held-out part may hold none
         whole = gaps.held_out.everywhere()
         parts.append(gap_share.part_of_spikes(statistical.spikes, whole.gap(gaps.runs_before, known=False),

@@ -193,10 +193,14 @@ class UnknownEffect:
     Attributes:
         place: where it acts.
         curves: the missing term is their sum.
+        id: of the effect by formula in the augmented model that was learned in its place; "" if none helps.
+        closes: share of the gap that this closes.
     """
 
     place: str
     curves: tuple[Curve, ...]
+    id: str = ""
+    closes: Interval | None = None
 
 
 Setting = bool | int | float | str | tuple[float, ...]

@@ -134,6 +134,10 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
     elif which.verdict == "unknown":
         lines.append(f"verdict: unknown ({document.where.place}). No effect of the catalogue explains the misfit"
                      f"{f': {why}' if why else ''}.")
+        if which.unknown is not None and which.unknown.closes is not None:
+            lines.append(f"  learned in its place: {which.unknown.id} in augmented.yaml, a function of "
+                         f"{enumerated([c.variable for c in which.unknown.curves])}; it closes "
+                         f"{of_the_gap(which.unknown.closes)}")
     else:
         left = {"part": f"; {_spaced(sentence.open_part(closure))} stays open",
                 "none": "; none of the gap closes on held-out data"}.get(sentence.closing(closure), "")

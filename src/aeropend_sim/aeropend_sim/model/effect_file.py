@@ -30,8 +30,8 @@ UNITS = {"actuator": "V", "electrical": "V", "rotor": "N·m", "thrust": "N", "ar
 MOST_EFFECTS = 50
 """Greatest number of effects in a file. A choice: each is a hypothesis of its own."""
 
-MOST_PARAMETERS = 40
-"""Greatest number of parameters of an effect. A choice: a curve of 16 points has 32."""
+MOST_PARAMETERS = 60
+"""Greatest number of parameters of an effect. A choice: a learned term has up to 44."""
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,39}")
 _KEYS = ("place", "physics", "term", "reading", "memory", "parameters")
@@ -91,6 +91,12 @@ def define(tree: object, where: str) -> dict[str, Effect]:
         if DEFINED.setdefault(id_, effect) != effect:
             raise EffectError(f"{where}: the effect {id_} is defined otherwise in another file: rename one of them")
     return found
+
+
+def forget(id_: str) -> None:
+    """Make an effect by formula unknown again, of which no model is left."""
+    if id_ not in CATALOGUE:
+        DEFINED.pop(id_, None)
 
 
 def definitions(ids: object) -> dict[str, dict[str, object]]:

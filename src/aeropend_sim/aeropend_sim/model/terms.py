@@ -95,20 +95,25 @@ def terms(effects: Mapping[str, Mapping[str, float]], places: Sequence[str] = PL
                     key=lambda one: places.index(one[0].reading or one[0].place))
     if not active:
         return None
-    numbers = np.array([float(p[name]) for e, p in active for name in e.parameters])
-    calls = np.zeros((len(active), COLUMNS), dtype=np.int64)
-    at = numbers.ctypes.data
-    memories = 0
-    for row, (e, _) in zip(calls, active, strict=True):
+    rows, memories = [], 0
+    for e, p in active:
         own = tuple(e.parameters)
         rate = compiled(e.rate, own, e.memory).address if e.memory else 0
-        row[:] = compiled(e.term, own, e.memory).address, rate, min(memories, SLOTS), at
-        at += 8 * len(own)
+        rows.append((compiled(e.term, own, e.memory).address, rate, min(memories, SLOTS), [p[name] for name in own]))
         memories += bool(e.memory)
     if memories > SLOTS:
         raise UserError(f"{memories} effects by formula with a memory; {SLOTS} are possible in one model")
-    ends = [sum((e.reading or e.place) in places[:k + 1] for e, _ in active) for k in range(len(PLACES))]
-    held = _Held(calls.ctypes.data, memories, *ends)
+    return _held(rows, [sum((e.reading or e.place) in places[:k + 1] for e, _ in active) for k in range(len(PLACES))])
+
+
+def _held(rows: Sequence[tuple[int, int, int, Sequence[float]]], ends: Sequence[int]) -> Terms:
+    """Terms by the addresses of term and rate, slot of the memory and parameters; and the end of each place."""
+    numbers = np.array([float(x) for *_, own in rows for x in own])
+    calls, at = np.zeros((len(rows), COLUMNS), dtype=np.int64), numbers.ctypes.data
+    for call, (term, rate, slot, own) in zip(calls, rows, strict=True):
+        call[:] = term, rate, slot, at
+        at += 8 * len(own)
+    held = _Held(calls.ctypes.data, sum(rate != 0 for _, rate, *_ in rows), *ends)
     held.arrays = calls, numbers
     return held
 
@@ -217,10 +222,34 @@ def series(effects: Mapping[str, Mapping[str, float]], place: str, count: int, p
         (N,) sum.
     """
     x = terms(effects, (place,))
-    out = np.zeros(count)
-    if x is not None:
-        values = np.zeros((len(QUANTITIES), count))
-        for row, name in zip(values, QUANTITIES, strict=True):
-            row[:] = known.get(name, np.arange(count) * period if name == "t" else 0.0)
-        _series(values, period, x, out)
+    return np.zeros(count) if x is None else _along(x, count, period, known)
+
+
+def along(text: str, parameters: Mapping[str, float], count: int, period: float, memory: str = "", rate: str = "",
+          **known: Array) -> Array:
+    """Value of a formula over a recording.
+
+    Args:
+        text: the formula.
+        parameters: by name.
+        count: N, number of samples.
+        period: [s] time between samples.
+        memory: name of its memory; "" for none.
+        rate: formula of the derivative of that memory.
+        **known: as for `series`.
+
+    Returns:
+        (N,) values.
+    """
+    names = tuple(parameters)
+    addresses = [compiled(each, names, memory).address if each else 0 for each in (text, rate)]
+    return _along(_held([(addresses[0], addresses[1], 0, list(parameters.values()))], [1] * len(PLACES)), count, period,
+                  known)
+
+
+def _along(x: Terms, count: int, period: float, known: Mapping[str, Array]) -> Array:
+    values, out = np.zeros((len(QUANTITIES), count)), np.zeros(count)
+    for row, name in zip(values, QUANTITIES, strict=True):
+        row[:] = known.get(name, np.arange(count) * period if name == "t" else 0.0)
+    _series(values, period, x, out)
     return out

@@ -24,8 +24,10 @@ TERMS = {
     ("actuator", "V"): "voltage", ("electrical", "V"): "voltage in the winding",
     ("electrical", "Ω"): "voltage in the winding per ampere", ("rotor", "N·m"): "torque on the rotor",
     ("thrust", "rad/s²"): "force of the air, as acceleration of the arm", ("thrust", "-"): "share of the thrust",
+    ("thrust", "N"): "force of the air",
     ("arm", "rad/s²"): "torque on the arm, as acceleration", ("arm", "1/s"): "torque on the arm, per arm rate",
     ("sensing", "rad"): "error of the angle reading", ("sensing", "A"): "error of the current reading",
+    ("sensing", "V"): "error of the voltage reading",
 }
 """What is missing, by place and unit; positive where it drives or lifts."""
 

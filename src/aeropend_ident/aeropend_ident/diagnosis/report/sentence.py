@@ -134,7 +134,9 @@ def consequence(document: DiagnosisDocument) -> str:
         return f"There is nothing to close: the gap is within the noise of the readings.{_tests(document)}"
     it = "it" if len(which.effects) == 1 else "them"
     action = "Refitting the parameters"
-    if which.effects and which.verdict == "unknown":
+    if which.unknown is not None and which.unknown.id and which.verdict == "unknown":
+        action = "The term that was learned from the recording"
+    elif which.effects and which.verdict == "unknown":
         action = f"Adding {it} and refitting the parameters"
     elif which.effects == (PARAMETER_MISMATCH,):
         action = f"Correcting {'it' if len(_parameters(document)) == 1 else 'them'} and refitting the other parameters"
