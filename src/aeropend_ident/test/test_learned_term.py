@@ -31,10 +31,10 @@ HIDDEN = {
 effect_file.define(HIDDEN, "test_learned_term")
 
 
-@pytest.fixture(scope="module", params=sorted(HIDDEN))
+@pytest.fixture(scope="module", params=["hidden_gear", "hidden_hose"])
 def verdict(request):
     """A rig with an effect that the catalogue does not hold, and its diagnosis."""
-    signals = recorded(104, {request.param: {}})
+    signals = recorded(104, {request.param: {}}, duration=30.0)
     return request.param, diagnose(BENCH, [signals], 2)
 
 

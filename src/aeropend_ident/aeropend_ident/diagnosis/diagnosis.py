@@ -432,8 +432,8 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
                                                       head.claimed, share, found.onset)
                        if found.learned is None or c.effect != found.learned.id)
     unlearned = {} if found.learned is None else {found.learned.without.stage: found.learned.without}
-    reasons = [f"{c} is off by {times(x)} a reading's noise"
-               for c, x in _left({**stages, **unlearned}, gust=found.statistical.gust is not None).items() if x > GOOD_ENOUGH]
+    left = _left({**stages, **unlearned}, gust=found.statistical.gust is not None)
+    reasons = [f"{c} is off by {times(x)} a reading's noise" for c, x in left.items() if x > GOOD_ENOUGH]
     reasons = [failed] if failed else reasons
     undecided = conclude.not_separable(chains, stages)
     tried = EXPERIMENTS if calibrated else experiments_within(max(s.largest_duty for s in found.recordings))
