@@ -101,10 +101,17 @@ class CurvePicture:
 
 @dataclass(frozen=True)
 class Unknown:
-    """The content of the section; `pictures`: the curve that does most comes first."""
+    """The content of the section.
+
+    Attributes:
+        place: of the effect.
+        pictures: the curve that does most comes first.
+        learned: id of the term in the augmented model that the curves are; "" if they are only a picture.
+    """
 
     place: str
     pictures: list[CurvePicture]
+    learned: str = ""
 
 
 @dataclass(frozen=True)
@@ -159,7 +166,8 @@ def draw(unknown: UnknownEffect, factors: Factors, fitted: float) -> Unknown | N
         factors: what multiplies the curves.
         fitted: [s] end of the fitted data; nothing determines a curve over time after it.
     """
-    curves = [c for c in (_curve(row, factors, fitted) for row in _rows(unknown.curves)) if c is not None]
+    bends = not unknown.id  # a learned term is drawn as the plant runs it
+    curves = [c for c in (_curve(row, factors, fitted, bends=bends) for row in _rows(unknown.curves)) if c is not None]
     if not curves:
         return None
     curves.sort(key=lambda c: -c.amount)
@@ -169,7 +177,7 @@ def draw(unknown: UnknownEffect, factors: Factors, fitted: float) -> Unknown | N
         alike = [c for c in curves if c.unit == unit]
         share = max(c.amount for c in alike) / most if most > 0.0 else 1.0
         spans[unit] = max(float(np.ptp(np.append(c.y, 0.0))) for c in alike) * max(1.0, 0.5 / max(share, 1e-6))
-    return Unknown(unknown.place, [_picture(c, unknown.place, spans[c.unit], most) for c in curves])
+    return Unknown(unknown.place, [_picture(c, unknown.place, spans[c.unit], most) for c in curves], unknown.id)
 
 
 def _rms(x: Array) -> float:
@@ -195,7 +203,7 @@ def _rows(curves: Sequence[Curve]) -> list[tuple[str, str, Array, Array]]:
     return rows
 
 
-def _curve(row: tuple[str, str, Array, Array], factors: Factors, fitted: float) -> _Curve | None:
+def _curve(row: tuple[str, str, Array, Array], factors: Factors, fitted: float, *, bends: bool) -> _Curve | None:
     name, unit, x, y = row
     over, _, factor_name = name.partition(" (")
     factor = factors.step if over == "steps" else factors.of(factor_name.rstrip(")"))
@@ -214,6 +222,8 @@ def _curve(row: tuple[str, str, Array, Array], factors: Factors, fitted: float) 
     def amount(z: Array) -> float:
         return factor * float(np.sqrt(np.average((z - np.average(z, weights=weight))**2, weights=weight)))
 
+    if not bends:
+        return _Curve(name, unit, x, y, line, amount(y))
     if not factor_name and over != "t":
         line = np.asarray(np.polyval(np.polyfit(x, y, 1, w=np.sqrt(weight)), x), dtype=np.float64)
     # constants move freely between curves and parameters: drawn from where the variable is zero
