@@ -278,7 +278,7 @@ def chapter_5(figure: str, seed: int = 0) -> Iterator[str]:
     peer: Array | None = None
     if figure != "5.17":
         try:
-            import pysindy  # type: ignore[import-untyped]
+            import pysindy
         except ImportError:
             pysindy = None
         peer = None if pysindy is None else as_printed(figure, pysindy, seed)

@@ -122,6 +122,7 @@ _SYMBOLS = {
     "H": _dimension(kg=1, m=2, s=-2, A=-2), "F": _dimension(kg=-1, m=-2, s=4, A=2),
 }
 _SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
+_TO_SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 _FACTOR = re.compile(r"(rad|Hz|kg|[-1%msAHNWJVΩF])(?:\^?(-?\d+)|([⁰¹²³⁴⁵⁶⁷⁸⁹⁻]+))?[·* ]?")
 
 
@@ -136,21 +137,53 @@ def dimension(unit: str, of: str = "") -> Dimension:
         FormulaError: it is not a unit.
     """
     total = _dimension()
+    for symbol, exponent in _powers(unit, of).items():
+        total = tuple(t + exponent * d for t, d in zip(total, _SYMBOLS[symbol], strict=True))
+    return total
+
+
+def _powers(unit: str, of: str = "") -> dict[str, int]:
+    """The factors of a unit and their powers."""
+    found: dict[str, int] = {}
     above, _, below = unit.translate({ord("("): "", ord(")"): "", 0x2126: "Ω"}).partition("/")
     below = below.replace("/", "·")
     for part, power in ((above, 1), (below, -1)):
         at = 0
         while at < len(part):
-            found = _FACTOR.match(part, at)
-            if found is None:
+            factor = _FACTOR.match(part, at)
+            if factor is None:
                 raise FormulaError(f"{of}{': ' * bool(of)}'{unit}' is not a unit; write factors such as "
                                    f"{', '.join(_SYMBOLS)}, as in N·m/s²")
-            exponent = power * int(found[2] or (found[3] or "1").translate(_SUPERSCRIPTS))
-            total = tuple(t + exponent * d for t, d in zip(total, _SYMBOLS[found[1]], strict=True))
-            at = found.end()
+            exponent = power * int(factor[2] or (factor[3] or "1").translate(_SUPERSCRIPTS))
+            found[factor[1]] = found.get(factor[1], 0) + exponent
+            at = factor.end()
     if not above:
         raise FormulaError(f"the unit of {of or 'a quantity'} is missing; write - for a pure number")
-    return total
+    return found
+
+
+def product(factors: Sequence[tuple[str, int]]) -> str:
+    """Unit of a product.
+
+    Args:
+        factors: the unit and the power of each factor.
+
+    Raises:
+        FormulaError: one of them is not a unit.
+    """
+    total: dict[str, int] = {}
+    for unit, power in factors:
+        for symbol, exponent in _powers(unit).items():
+            total[symbol] = total.get(symbol, 0) + power * exponent
+
+    def joined(sign: int) -> str:
+        return "·".join(symbol + (str(abs(x)).translate(_TO_SUPERSCRIPTS) if abs(x) != 1 else "")
+                        for symbol, x in total.items() if x * sign > 0 and symbol not in ("-", "1"))
+
+    above, below = joined(1), joined(-1)
+    if not below:
+        return above or "-"
+    return f"{above or '1'}/{f'({below})' if '·' in below else below}"
 
 
 def _written(d: Dimension) -> str:
