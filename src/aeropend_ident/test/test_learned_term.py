@@ -65,6 +65,19 @@ def test_the_plant_runs_what_was_learned(verdict, tmp_path):
     assert np.std(truth - again) < 0.5 * np.std(truth - nominal)
 
 
+def test_a_formula_is_proposed_and_is_tomorrows_catalogue_entry(verdict, tmp_path):
+    id_, found = verdict
+    closure, formulas = found.conclusions.closure, found.conclusions.which.unknown.formulas
+    assert formulas[0].gap_after < 1.2 * closure.gap_after
+    results = Results.of(found, document(found, ["a bag"], "bench", 1.0), "diagnose a bag")
+    results.write(tmp_path / "out", overwrite=False)
+    proposed = effect_file.load(tmp_path / "out" / "proposed.yaml")
+    assert list(proposed) == [f.id for f in formulas]
+    again = diagnose(BENCH, [recorded(105, {id_: {}}, duration=30.0)], 2, further=[formulas[0].id])
+    assert again.conclusions.which.verdict == formulas[0].id
+    assert again.conclusions.closure.closed > 0.9
+
+
 def test_every_form_makes_an_effect_whose_units_are_right():
     for forms in FORMS.values():
         for place in {(f.place, f.reading) for f in forms}:

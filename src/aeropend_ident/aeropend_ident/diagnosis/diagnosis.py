@@ -7,6 +7,7 @@ judge whether an effect is unknown -> fit all jointly -> measure the gap -> conc
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -35,6 +36,7 @@ from aeropend_ident.diagnosis.document import (
     Closure,
     Conclusions,
     Curve,
+    Formula,
     GapBudget,
     Residual,
     Where,
@@ -49,6 +51,7 @@ from aeropend_ident.diagnosis.joint_fit import JointFit, fit_jointly
 from aeropend_ident.diagnosis.policy import GOOD_ENOUGH, MATERIAL_SHARE, angle_only, policy_of
 from aeropend_ident.diagnosis.search import gust, onset, speed_spikes, unknown_effect
 from aeropend_ident.diagnosis.search.findings import Findings
+from aeropend_ident.diagnosis.search.formula_fit import fitted_formulas
 from aeropend_ident.diagnosis.search.free_curves import MissingTerm, Repeatable
 from aeropend_ident.diagnosis.search.learned_term import Learned, learn
 from aeropend_ident.diagnosis.search.onset import Onset
@@ -57,6 +60,7 @@ from aeropend_ident.diagnosis.search.unknown_effect import UnknownEffect
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import CHANNELS, Signals
 from aeropend_ident.signals.statistics import rms
+from aeropend_sim.model.effects import DEFINED
 from aeropend_sim.model.parameters import Model
 from aeropend_sim.wording import times
 
@@ -447,7 +451,8 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
         which=Which(head.verdict, tuple(head.effects), candidates, rows,
                     {channel: Residual(check.rms[channel], check.white[channel], check.dependence)
                      for check in joint.checks.values() for channel in check.rms},
-                    tuple(reasons), None if unknown is None else _drawn(unknown.term, found.learned, joint, gaps),
+                    tuple(reasons), None if unknown is None else _drawn(unknown.term, found.learned, joint, gaps,
+                                                                          settings.jobs),
                     tuple(conclude.names(a, b) for a, b in undecided),
                     conclude.next_experiment(chains.model, found.recordings[0], undecided, joint.values, tried,
                                              settings.jobs),
@@ -472,7 +477,7 @@ def _why_not_predicted(chains: CutChains, gaps: _Gaps) -> str:
             "a longer recording whose last third repeats angles and duties of the part before helps most")
 
 
-def _drawn(term: MissingTerm, learned: Learned | None, joint: JointFit, gaps: _Gaps) -> DrawnEffect:
+def _drawn(term: MissingTerm, learned: Learned | None, joint: JointFit, gaps: _Gaps, jobs: int) -> DrawnEffect:
     """The unknown effect by the curves of the term that was learned; by free curves if none was."""
     if learned is None:
         return DrawnEffect(term.place, tuple(
@@ -480,7 +485,18 @@ def _drawn(term: MissingTerm, learned: Learned | None, joint: JointFit, gaps: _G
     share = gap_share.shares(gap_share.parts_of_effects(joint, gaps.held_out.in_motion()))
     curves = tuple(Curve(f"{c.form.of}{FACTORS[c.form.factor]}", c.form.value_unit, tuple(c.knot.tolist()),
                          tuple(learned.values_of(c, joint.values))) for c in learned.curves)
-    return DrawnEffect(learned.place, curves, learned.id, share.get(learned.id))
+    with ThreadPoolExecutor(jobs) as pool:
+        fitted = fitted_formulas(gaps.held_out.chains, learned, joint.values, joint.sd, pool)
+    formulas = tuple(Formula(f.id, DEFINED[f.id].term, {n: p.default for n, p in DEFINED[f.id].parameters.items()},
+                             _gap_with(f.values, learned, joint, gaps)) for f in fitted)
+    return DrawnEffect(learned.place, curves, learned.id, share.get(learned.id), formulas)
+
+
+def _gap_with(values: Mapping[str, float], learned: Learned, joint: JointFit, gaps: _Gaps) -> float | None:
+    """The gap with a formula in place of the learned term; None if the model diverges."""
+    others = {n: v for n, v in joint.values.items() if key(n).owner != learned.id}
+    after = gaps.held_out.gap_of({**others, **values}).total
+    return after if math.isfinite(after) else None
 
 
 FACTORS = {"": "", "thrust": " (share of the thrust)", "theta_dot": " (damping)", "i_a": " (resistance)"}

@@ -187,6 +187,23 @@ class Curve:
 
 
 @dataclass(frozen=True)
+class Formula:
+    """A formula that may stand in place of a learned term.
+
+    Attributes:
+        id: of the effect in `proposed.yaml`.
+        term: the formula.
+        parameters: estimates by name.
+        gap_after: [share of the spread] gap on held-out data with it; null if the model then diverges.
+    """
+
+    id: str
+    term: str
+    parameters: Mapping[str, float]
+    gap_after: float | None
+
+
+@dataclass(frozen=True)
 class UnknownEffect:
     """An effect that the catalogue does not hold.
 
@@ -195,12 +212,15 @@ class UnknownEffect:
         curves: the missing term is their sum.
         id: of the effect by formula in the augmented model that was learned in its place; "" if none helps.
         closes: share of the gap that this closes.
+        formulas: that may stand in its place, the one that leaves least of the fitted part first, of alike ones the
+            shortest.
     """
 
     place: str
     curves: tuple[Curve, ...]
     id: str = ""
     closes: Interval | None = None
+    formulas: tuple[Formula, ...] = ()
 
 
 Setting = bool | int | float | str | tuple[float, ...]

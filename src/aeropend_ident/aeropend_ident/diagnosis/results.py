@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from aeropend_ident.diagnosis.chain.values import limits
@@ -32,12 +32,16 @@ from aeropend_ident.diagnosis.report.number_format import fit_text, plain, plain
 from aeropend_ident.diagnosis.report.parameters import lift_text
 from aeropend_ident.result_folder import atomic_folder, ensure_free
 from aeropend_ident.signals.signals import Signals
+from aeropend_sim.model import effect_file
 from aeropend_sim.model.parameters import Model, save
 from aeropend_sim.untrusted import printable
 from aeropend_sim.wording import enumerated
 
 FILES = ("diagnosis.json", "report.html", "augmented.yaml")
 """Names of the files that a diagnosis writes."""
+
+PROPOSED = "proposed.yaml"
+"""Name of the effect file of the formulas that are proposed for an unknown effect, if there are any."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,7 @@ class Results:
         page: the content of `report.html`.
         augmented: the model with what was found.
         command: the command line that led here.
+        definitions: of its effects by formula, and of those proposed; another process may write the results.
     """
 
     document: DiagnosisDocument
@@ -57,6 +62,7 @@ class Results:
     page: str
     augmented: Model
     command: str
+    definitions: Mapping[str, Mapping[str, object]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, diagnosis: Diagnosis, document: DiagnosisDocument, command: str) -> Results:
@@ -69,7 +75,9 @@ class Results:
         """
         lines = [f"note: {note}" for note in document.notes] + verdict_lines(document)
         lines = [printable(line) for line in lines]
-        return cls(document, lines, page.render(diagnosis, document, command), diagnosis.augmented, command)
+        ids = [*diagnosis.augmented.effects, *_proposed(document)]
+        return cls(document, lines, page.render(diagnosis, document, command), diagnosis.augmented, command,
+                   effect_file.definitions(ids))
 
     def write(self, out: Path, *, overwrite: bool) -> None:
         """Write all files, or none.
@@ -82,11 +90,23 @@ class Results:
             OutputError: the folder cannot be made or written, or holds results already.
         """
         ensure_free(out, FILES, overwrite=overwrite)
-        with atomic_folder(out, FILES) as place:
+        if self.definitions:
+            effect_file.define(self.definitions, str(out))
+        proposed = {id_: self.definitions[id_] for id_ in _proposed(self.document)}
+        with atomic_folder(out, [*FILES, *[PROPOSED] * bool(proposed)]) as place:
+            if proposed:
+                effect_file.save(proposed, place / PROPOSED, self.command)
             text = json.dumps(to_json(self.document), indent=1, allow_nan=False) + "\n"
             (place / "diagnosis.json").write_text(text, encoding="utf-8")
             (place / "report.html").write_text(self.page, encoding="utf-8", errors="backslashreplace")
             save(self.augmented, place / "augmented.yaml", f"{self.command}\n" + "\n".join(self.lines))
+        if not proposed:
+            (out / PROPOSED).unlink(missing_ok=True)
+
+
+def _proposed(document: DiagnosisDocument) -> list[str]:
+    """Ids of the formulas that are proposed for an unknown effect."""
+    return [f.id for f in document.which.unknown.formulas] if document.which.unknown is not None else []
 
 
 def document(diagnosis: Diagnosis, bags: Sequence[str], model: str, seconds: float,
@@ -138,6 +158,9 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
             lines.append(f"  learned in its place: {which.unknown.id} in augmented.yaml, a function of "
                          f"{enumerated([c.variable for c in which.unknown.curves])}; it closes "
                          f"{of_the_gap(which.unknown.closes)}")
+            lines += [f"  perhaps: {f.term} ({', '.join(f'{n} = {plain(x)}' for n, x in f.parameters.items())}), "
+                      f"gap {plain_percent(f.gap_after, 1)} %; try --effects {PROPOSED}"
+                      for f in which.unknown.formulas[:1] if f.gap_after is not None]
     else:
         left = {"part": f"; {_spaced(sentence.open_part(closure))} stays open",
                 "none": "; none of the gap closes on held-out data"}.get(sentence.closing(closure), "")

@@ -13,7 +13,7 @@ import yaml
 from aeropend_sim.errors import UserError
 from aeropend_sim.model.effects import CATALOGUE, DEFINED, PARAMETER_MISMATCH, PLACES, Effect, EffectParameter
 from aeropend_sim.model.formula import CONSTANTS, FUNCTIONS, QUANTITIES, FormulaError, dimension, parse
-from aeropend_sim.untrusted import NumberLoader, load_yaml, one_line
+from aeropend_sim.untrusted import NumberLoader, load_yaml, one_line, printable
 
 USES = {
     "actuator": ("v", "i_a", "t"), "electrical": ("i_a", "omega", "v", "t"), "rotor": ("omega", "i_a", "v", "t"),
@@ -91,6 +91,29 @@ def define(tree: object, where: str) -> dict[str, Effect]:
         if DEFINED.setdefault(id_, effect) != effect:
             raise EffectError(f"{where}: the effect {id_} is defined otherwise in another file: rename one of them")
     return found
+
+
+def save(tree: Mapping[str, Mapping[str, object]], path: Path, comment: str = "") -> None:
+    """Write an effect file.
+
+    Args:
+        tree: id -> definition.
+        path: the file.
+        comment: lines at its top.
+    """
+    head = "".join(f"# {printable(line)}\n" for line in comment.splitlines())
+    text = yaml.safe_dump({id_: dict(one) for id_, one in tree.items()}, sort_keys=False, allow_unicode=True, width=120)
+    path.write_text(head + text, encoding="utf-8")
+
+
+def unit_of(place: str, reading: str = "") -> str:
+    """The unit of a term.
+
+    Args:
+        place: of the chain.
+        reading: that it is added to, at place `sensing`.
+    """
+    return READINGS[reading][0] if reading else UNITS[place]
 
 
 def forget(id_: str) -> None:

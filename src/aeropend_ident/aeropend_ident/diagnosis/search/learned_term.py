@@ -395,7 +395,7 @@ def _may_follow(form: Form, there: Sequence[Curve]) -> bool:
 
 def _curve(chains: CutChains, form: Form, base: Mapping[str, float]) -> Curve | None:
     """A form with its knots over all recordings; None if its quantity hardly varies."""
-    seen = [_quantity(chain, form, chains.values_of(base, k)) for k, chain in enumerate(chains.each)]
+    seen = [quantity(chain, form, chains.values_of(base, k)) for k, chain in enumerate(chains.each)]
     known = np.concatenate([x[:chain.signals.train] for x, chain in zip(seen, chains.each, strict=True)])
     knot = knots_of(known, POINTS)
     if not len(knot):
@@ -404,8 +404,17 @@ def _curve(chains: CutChains, form: Form, base: Mapping[str, float]) -> Curve | 
     return Curve(form, 0.5 * (knot + even))  # where there are few readings a curve needs points too
 
 
-def _quantity(chain: CutChain, form: Form, values: Mapping[str, float]) -> Array:
-    """(N,) The quantity of a form along a recording."""
+def quantity(chain: CutChain, form: Form, values: Mapping[str, float]) -> Array:
+    """The quantity of a form along a recording.
+
+    Args:
+        chain: of the recording.
+        form: of a curve.
+        values: of a fit, for this recording.
+
+    Returns:
+        (N,) in the unit of the form.
+    """
     s = chain.signals
     known: dict[str, Array] = {}
     if form.place == "actuator" or form.reading == "v_a":
@@ -416,7 +425,8 @@ def _quantity(chain: CutChain, form: Form, values: Mapping[str, float]) -> Array
         known = {"i_a": i, "omega": omega}
     else:
         theta, rate = chain.arm_motion(values)
-        known = {"theta": theta, "theta_dot": rate, "omega": chain.speed}
+        n = chain.valued(values).numbers()
+        known = {"theta": theta, "theta_dot": rate, "omega": chain.speed, "thrust": actuator.thrust(n, chain.speed)}
     return along(form.of, {"tau": form.tau or 1.0}, len(s), s.period, "z" if form.rate else "", form.rate, **known)
 
 
