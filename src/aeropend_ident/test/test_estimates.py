@@ -77,3 +77,12 @@ def test_recordings_that_say_nothing_are_refused():
         estimates.plateaus(moved, ("theta",), "bag")
     with pytest.raises(BenchTestError, match="no current"):
         estimates.blocked_recording(blocked(0, high=1e-9), "bag")
+
+
+@pytest.mark.filterwarnings("error")
+def test_holds_of_which_a_channel_was_not_read_do_not_count():
+    read = recorded(BENCH, Excitation("staircase", duration=60.0).series())
+    every = estimates.plateaus(read, ["v_a", "i_a"], "bag")
+    read.i_a[len(read) // 2:] = np.nan
+    some = estimates.plateaus(read, ["v_a", "i_a"], "bag")
+    assert 3 <= len(some.columns["v_a"]) < len(every.columns["v_a"])

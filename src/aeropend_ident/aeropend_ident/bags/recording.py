@@ -9,12 +9,13 @@ Example:
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from aeropend_ident.bags import judging
 from aeropend_ident.bags.cdr import Block, decode
 from aeropend_ident.bags.container import Bag
 from aeropend_ident.bags.reading import RecordingError
@@ -129,15 +130,17 @@ class Recording:
         return int(self.gaps[:, 1].sum())
 
 
-def read(path: Path | str, namespace: str | None = None) -> Recording:
+def read(path: Path | str, namespace: str | None = None, *, judged: bool = True) -> Recording:
     """Read a bag into arrays.
 
     joint_states and armature are joined on header.stamp, whatever order they arrived in. Without armature the duty is
-    that of the last duty_command received before the sample; `notes` says so.
+    that of the last duty_command received before the sample; `notes` says so. Numbers that cannot be readings, and
+    stamps that cannot be times, are left out; `notes` says how many (`judging`).
 
     Args:
         path: a rosbag2 folder (metadata up to version 9) or a bare .mcap or .db3 file, broken off or not.
         namespace: the rig to read when the bag holds several: "/rig1".
+        judged: False leaves the numbers as they are recorded, for their unit to be changed.
 
     Raises:
         RecordingError: the bag cannot be used; the message is one line that says what to do.
@@ -156,7 +159,7 @@ def read(path: Path | str, namespace: str | None = None) -> Recording:
     found = _choose(rigs, namespace, bag)
     notes: list[str] = []
     try:
-        recording = _Join(rigs[found], notes).recording(str(path), found, complete=not bag.problems)
+        recording = _Join(rigs[found], notes, judged=judged).recording(str(path), found, complete=not bag.problems)
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from None
     if not bag.problems:
@@ -246,7 +249,7 @@ class _Table:
 class _Join:
     """The topics of one rig, joined on the stamps."""
 
-    def __init__(self, topics: dict[str, _Series], notes: list[str]) -> None:
+    def __init__(self, topics: dict[str, _Series], notes: list[str], *, judged: bool) -> None:
         self.notes = notes
         self.duplicates = 0
         empty = _Table(np.empty(0, np.int64), np.empty(0, np.int64), {})
@@ -268,6 +271,8 @@ class _Join:
         for table in (armature, joints):  # where both are there, the arrival of joint_states counts
             self.received[np.searchsorted(self.stamps, table.stamps)] = table.received
         self.columns = self._placed((armature, joints), CHANNELS)
+        if judged:
+            self.columns = {name: judging.channel(name, x, notes) for name, x in self.columns.items()}
         self.command = self._values(topics.get("duty_command"))
         self.reference = self._values(topics.get("reference"))
         if not len(armature.stamps):
@@ -275,7 +280,20 @@ class _Join:
         repeated = self.duplicates
         self.truth = self._truth(topics)
         self.duplicates = repeated
+        self._set_right()
         self.period, self.gaps, self.irregular = _grid(self.stamps)
+
+    def _set_right(self) -> None:
+        """Put the samples in order where the clock of the stamps was set."""
+        stamps, kept = judging.one_clock(self.stamps, self.received, self.notes)
+        rows = np.flatnonzero(kept)[np.argsort(stamps[kept], kind="stable")]
+        rows = rows[np.append(True, np.diff(stamps[rows]) > 0)]
+        if np.array_equal(stamps[rows], self.stamps):
+            return
+        self.stamps, self.received = stamps[rows], self.received[rows]
+        self.columns = {name: x[rows] for name, x in self.columns.items()}
+        if self.truth is not None:
+            self.truth = Truth(**{field.name: getattr(self.truth, field.name)[rows] for field in fields(Truth)})
 
     def recording(self, path: str, namespace: str, *, complete: bool) -> Recording:
         """Say what there is to say, and hand over the arrays."""
@@ -356,9 +374,12 @@ class _Join:
         stamps = np.zeros(len(series.messages), dtype=np.int64)
         understood = np.zeros(len(series.messages), dtype=bool)
         for block in blocks:
-            seconds = block.numbers["header.stamp.sec"].astype(np.int64)
-            stamps[block.rows] = seconds * 1_000_000_000 + block.numbers["header.stamp.nanosec"]
-            understood[block.rows] = True
+            seconds, rest = (block.numbers[f"header.stamp.{part}"].astype(np.int64) for part in ("sec", "nanosec"))
+            stamps[block.rows], understood[block.rows] = judging.times(seconds, rest)
+        timeless = sum(len(block.rows) for block in blocks) - int(understood.sum())
+        if timeless:
+            self.notes.append(f"{counted(timeless, 'message')} of {series.topic} {_has(timeless)} a stamp that is no "
+                              "time (before 1970, or nanosec of 1e9 or more): left out")
         if understood.sum() > 1 and not stamps.any():
             raise RecordingError(f"{series.topic}: header.stamp is never set, so its samples cannot be dated or joined")
         rows = np.flatnonzero(understood)
@@ -408,7 +429,7 @@ def _grid(stamps: Stamps) -> tuple[float, Stamps, int]:
     periods = np.rint(steps / np.median(steps)).astype(np.int64)
     before = np.flatnonzero(periods > 1)
     usual = np.abs(steps / np.median(steps) - 1.0) < OFF_GRID  # a pause need not be a whole number of periods
-    period = float(steps[usual].mean()) / 1e9
+    period = float(steps[usual].mean() if usual.any() else np.median(steps)) / 1e9
     irregular = int(np.sum(np.abs(steps / np.median(steps) - periods) > OFF_GRID))
     return period, np.stack((before, periods[before] - 1), axis=1), irregular
 

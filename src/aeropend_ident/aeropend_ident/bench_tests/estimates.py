@@ -463,6 +463,10 @@ def plateaus(recording: Recording, channels: Sequence[str], name: str) -> Rows:
         if recording.t[end - 1] - recording.t[start] < HOLD:
             continue
         half = slice((start + end) // 2, end)
+        quarters = [part for c in channels for part in np.array_split(getattr(recording, c)[half], 2)]
+        if not all(np.isfinite(part).any() for part in quarters):
+            unsettled += 1
+            continue
         means, spreads, steady_ = [], [], True
         for c in channels:
             x = getattr(recording, c)

@@ -40,6 +40,9 @@ NUMERIC = 1e-5
 FEWEST = 100
 """Least number of samples. Choice."""
 
+LEAST_PULSES = 10
+"""Least number of pulses of the speed. Choice."""
+
 SLOW_VOLTAGE = 0.05
 """[s] Window over which the slow part of a held voltage is smoothed. Choice."""
 
@@ -253,6 +256,9 @@ def _from_signals(name: str, signals: Signals, columns: Mapping[str, Array], sen
     p = signals.pulses
     if p is not None:
         use = ~p.false
+        if use.sum() < LEAST_PULSES:
+            raise RecordingError(f"{name}: the speed shows {int(use.sum())} pulses, too few to identify: check the "
+                                 "unit of omega (rad/s), and speed_pulses_per_rev in the model file")
         middle = p.time[use] - 0.5 * p.period[use]
         described["omega"] = np.interp(np.arange(n) * h, np.append(0.0, middle), np.append(0.0, p.omega[use]))
         coarse["omega"] = 2.0 * float(np.median(p.period[use])) / h

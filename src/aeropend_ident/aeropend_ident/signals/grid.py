@@ -108,7 +108,8 @@ def irregular_grid(stamps: NDArray[np.int64], longest: float = math.inf) -> tupl
     """
     since = (stamps - stamps[0]) * 1e-9
     usual = float(np.median(np.diff(since)))
-    usual = float(np.mean(np.diff(since)[np.abs(np.diff(since) / usual - 1.0) < OFF_GRID]))
+    near = np.diff(since)[np.abs(np.diff(since) / usual - 1.0) < OFF_GRID]
+    usual = float(np.mean(near)) if len(near) else usual
     index = np.rint(since / usual).astype(np.int64)
     if index[-1] > 0:  # a period that is slightly wrong would drift away over many stamps
         refined = float(since @ index) / float(index @ index)

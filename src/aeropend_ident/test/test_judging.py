@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What cannot be a reading or a time is left out where a recording is read, and counted; or refused in one line."""
+
+import math
+import struct
+from itertools import product
+
+import numpy as np
+import pytest
+
+from aeropend_ident.bags.recording import CHANNELS, RecordingError, read
+
+JOINT, BATTERY = "sensor_msgs/msg/JointState", "sensor_msgs/msg/BatteryState"
+N, PERIOD = 400, 20_000_000
+STAMPS = 1_700_000_000_000_000_000 + PERIOD * np.arange(N)
+DAY = 86_400 * 10**9
+
+
+def written(bags, tmp_path, *, columns=None, stamps=STAMPS, nanosec=None, received=STAMPS):
+    """A recording of N samples.
+
+    Args:
+        bags: makes them.
+        tmp_path: folder.
+        columns: channel -> (N,), 0.5 if it is not given.
+        stamps: [ns] (N,).
+        nanosec: (N,) instead of the rest of the second.
+        received: [ns] (N,).
+    """
+    columns = {name: np.full(N, 0.5) for name in CHANNELS} | (columns or {})
+    messages = []
+    for k in range(N):
+        theta, omega, i_a, v_a, duty = (float(columns[name][k]) for name in CHANNELS)
+        seconds, rest = divmod(int(stamps[k]), 10**9)
+        stamp = struct.pack("<iI", seconds, rest if nanosec is None else int(nanosec[k]))
+        for topic, kind, raw in (("/joint_states", JOINT, bags.joint(0, [theta, math.nan], [math.nan, omega])),
+                                 ("/armature", BATTERY, bags.battery(0, v_a, i_a, duty))):
+            messages.append((topic, kind, int(received[k]), raw[:4] + stamp + raw[12:]))
+    return bags.write(tmp_path / "bag", bags.Content(messages))
+
+
+BAD = np.isin(np.arange(N), [40, 41, 300])
+
+
+def single(value):
+    """A column of 0.5 with another value in three readings."""
+    return np.where(BAD, value, 0.5)
+
+
+@pytest.mark.parametrize(("channel", "value"), [*product(CHANNELS, [math.inf, -math.inf, 1e38, -1e38]),
+                                                ("theta", 1e300), ("omega", -1e300)])
+def test_numbers_that_are_no_readings_are_left_out_and_counted(bags, tmp_path, channel, value):
+    recording = read(written(bags, tmp_path, columns={channel: single(value)}))
+    assert np.flatnonzero(np.isnan(getattr(recording, channel))).tolist() == [40, 41, 300]
+    (note,) = recording.notes
+    assert note.startswith(f"3 readings of {channel} are no possible number (first ")
+    assert note.endswith("): left out")
+
+
+@pytest.mark.parametrize("value", [1.7, 55.0, -2.0])
+def test_a_few_duties_beyond_1_are_left_out_and_a_rounding_counts_as_1(bags, tmp_path, value):
+    column = single(value)
+    column[7] = 1.0 + 1e-6
+    recording = read(written(bags, tmp_path, columns={"duty": column}))
+    assert np.flatnonzero(np.isnan(recording.duty)).tolist() == [40, 41, 300]
+    assert recording.duty[7] == 1.0
+    assert f"first {value:g}, possible are -1 to 1" in recording.notes[0]
+
+
+@pytest.mark.parametrize(("full", "option"), [(100.0, "%"), (255.0, "counts:255")])
+def test_duties_that_are_no_fractions_are_refused_with_the_command_that_mends_them(bags, tmp_path, full, option):
+    bag = written(bags, tmp_path, columns={"duty": np.linspace(0.0, full, N)})
+    with pytest.raises(RecordingError, match=f"duty goes from 0 to {full:g}, .*`import BAG NEW --duty duty:{option}` "):
+        read(bag)
+    assert read(bag, judged=False).duty[-1] == full
+
+
+def test_a_reading_too_small_for_any_sensor_is_0(bags, tmp_path):
+    recording = read(written(bags, tmp_path, columns={"omega": single(1e-38)}))
+    assert recording.omega[40] == 0.0
+    assert recording.notes == ()
+
+
+@pytest.mark.parametrize("wrong", [{"nanosec": np.where(BAD, 1_500_000_000, STAMPS % 10**9)},
+                                   {"stamps": np.where(BAD, -5, STAMPS)}])
+def test_stamps_that_are_no_times_are_left_out_and_counted(bags, tmp_path, wrong):
+    recording = read(written(bags, tmp_path, **wrong))
+    assert recording.stamp_ns.tolist() == STAMPS[~BAD].tolist()
+    assert sum(note.startswith("3 messages of /") and "stamp that is no time" in note for note in recording.notes) == 2
+
+
+def test_a_recording_without_a_time_is_refused_in_one_line(bags, tmp_path):
+    with pytest.raises(RecordingError, match=r"no sample could be read: .* a stamp that is no time"):
+        read(written(bags, tmp_path, nanosec=np.full(N, 4_000_000_000)))
+
+
+@pytest.mark.parametrize("by", [-DAY, DAY, -5_003 * 10**6])
+def test_a_clock_that_is_set_goes_on_as_the_receive_times_do(bags, tmp_path, by):
+    late = np.arange(N) >= N // 2
+    theta = np.arange(N) / N
+    recording = read(written(bags, tmp_path, columns={"theta": theta}, stamps=STAMPS + by * late))
+    np.testing.assert_array_equal(recording.stamp_ns, STAMPS)
+    np.testing.assert_array_equal(recording.theta, theta)
+    (note,) = recording.notes
+    assert f"was set 1 time during the recording (first by {by / 1e9:.0f} s)" in note
+
+
+def test_single_stamps_far_away_are_left_out(bags, tmp_path):
+    far = np.arange(N) % 13 == 7
+    recording = read(written(bags, tmp_path, stamps=np.where(far, 10**15 * np.arange(N), STAMPS)))
+    assert recording.stamp_ns.tolist() == STAMPS[~far].tolist()
+    assert f"{far.sum()} samples have a stamp far from those around: left out" in recording.notes
+
+
+def test_a_pause_of_the_recorder_is_no_setting_of_the_clock(bags, tmp_path):
+    late = np.arange(N) >= N // 2
+    recording = read(written(bags, tmp_path, stamps=STAMPS + DAY * late, received=STAMPS + DAY * late))
+    assert recording.duration > 86_400.0
+    assert not any("clock" in note for note in recording.notes)
+
+
+def test_receive_times_that_tell_nothing_change_no_stamp(bags, tmp_path):
+    rng = np.random.default_rng(0)
+    for number, received in enumerate((np.zeros(N), STAMPS[0] + rng.integers(0, 10**12, N))):
+        (tmp_path / f"{number}").mkdir()
+        assert read(written(bags, tmp_path / f"{number}", received=received)).stamp_ns.tolist() == STAMPS.tolist()
