@@ -341,6 +341,7 @@ def test_nan_gives_duty_0_at_once_and_halves_may_come_in_any_order(graph, by_han
     assert by_hand.sample(0.1) == 0.0  # it went beyond the limit
     assert "theta of a sample is NaN" in by_hand.controller.output
     assert by_hand.controller.output.count("NaN") == 1
+    assert by_hand.controller.output.count("theta of a sample is no possible number: left out") == 1
 
 
 @pytest.mark.promise("Control", "Without samples for 50 ms the duty is 0, and the law restarts with the next sample")

@@ -105,6 +105,9 @@ def test_commands_are_clamped_and_nonsense_is_refused_and_counted(graph, start):
         assert counters["enabled"] == "True"
         applied(0.3)
     assert plant.output.count("refused") == 1
+    assert plant.output.count("duty_command 7 is outside 0 to 1: clamped (give a fraction, not percent)") == 1
+    assert counters["clamped commands"] == "2"
+    assert plant.output.count("clamped") == 1
 
 
 def test_a_bridge_that_reverses_takes_commands_below_0(graph, start):

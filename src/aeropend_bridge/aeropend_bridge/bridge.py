@@ -324,6 +324,7 @@ class Bridge(RigInterface):
             **{name.replace("_", " "): count for name, count in asdict(self._counts).items()},
             "bad frames": self._receiver.bad,
             "refused commands": self.refused,
+            "clamped commands": self.clamped,
             "dropped writes": self._link.dropped,
             "clock steps": self.clock_steps,
             "longest gap s": self._gap_max,

@@ -87,6 +87,27 @@ def test_a_law_without_a_duty_gives_0_and_starts_anew(loop, duty):
     assert loop.sample() == 0.01
 
 
+@pytest.mark.parametrize("omega", [math.inf, -math.inf, 1e300, -1e7])
+def test_a_reading_that_is_no_possible_number_is_a_missing_one_and_said(loop, omega):
+    loop.sample()
+    assert loop.sample(omega=omega) == 0.02
+    assert math.isnan(loop.law.samples[-1].omega)
+    assert loop.supervisor.doubt == "omega of a sample is no possible number: left out"
+    assert loop.supervisor.counts["impossible"] == 1
+    assert loop.sample() == 0.03
+    assert loop.supervisor.doubt == ""
+    assert loop.sample(theta=omega) == 0.0
+    assert loop.sample() == 0.05  # it did not go beyond the angle limit: it was no angle
+
+
+@pytest.mark.parametrize("duty", [math.inf, 55.0, math.nan])
+def test_a_duty_that_is_no_share_was_not_applied(loop, duty):
+    loop.supervisor.note_applied(duty)
+    loop.sample()
+    loop.sample(after=1000)  # a gap: the law starts anew from the duty that was applied
+    assert loop.law.since == 0.0
+
+
 def test_a_duty_is_a_share(loop):
     loop.law.output = 1.7
     assert loop.sample() == 1.0

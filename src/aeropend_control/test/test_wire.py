@@ -52,6 +52,17 @@ def test_big_endian_is_read_too():
     assert wire.armature(head + struct.pack(">7f", 1.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.5)) == (5_000_000_006, 2.0, 1.0, 0.5)
 
 
+@pytest.mark.parametrize(("seconds", "nanoseconds"), [(-1, 0), (5, 10**9), (5, 2**32 - 1), (-2**31, 0)])
+def test_a_stamp_that_is_no_time_is_malformed(seconds, nanoseconds):
+    stamp = struct.pack("<iI", seconds, nanoseconds)
+    for message, read in ((interface.joint_states_message(STAMP, 0.1, 50.0), wire.joints),
+                          (interface.armature_message(STAMP, 1.5, 0.2, 0.7), wire.armature)):
+        raw = serialize_message(message)
+        for function in (read, wire.stamp_ns):
+            with pytest.raises(wire.MALFORMED, match="no time"):
+                function(raw[:4] + stamp + raw[12:])
+
+
 def test_what_is_broken_off_or_of_another_encoding_is_said():
     raw = serialize_message(interface.joint_states_message(STAMP, 0.1, 50.0))
     with pytest.raises(struct.error):

@@ -94,5 +94,6 @@ def test_the_rotor_turns_with_its_speed_over_the_stamps():
 def test_the_rotor_stays_where_its_motion_is_not_known():
     rotor = Rotor()
     rotor.turn(10**9, 100.0)
-    for stamp, omega in ((10**9 + 10**7, math.nan), (10**9, 100.0), (10**9 + round(2e9 * PAUSE_S), 100.0)):
+    for stamp, omega in ((10**9 + 10**7, math.nan), (10**9 + 2 * 10**7, math.inf), (10**9 + 3 * 10**7, 1e300),
+                         (10**9, 100.0), (10**9 + round(2e9 * PAUSE_S), 100.0)):
         assert rotor.turn(stamp, omega) == 0.0

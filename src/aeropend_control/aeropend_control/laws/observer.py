@@ -225,7 +225,9 @@ def _correct_motor(omega: float, i_a: float, s: dynamics.State, m: MotorCorrecti
     use, time, error = not math.isnan(omega), chain.h, omega - s.omega
     if use and chain.pulses > 0.0:
         turn = 2.0 * math.pi / chain.pulses
-        if omega == 0.0:
+        if omega < 0.0:
+            use = False  # a counter of pulses does not tell the direction: this is no reading
+        elif omega == 0.0:
             use = s.rotor_angle - at_pulse >= 3.0 * turn  # else it is too early for a reading
         elif omega == read:
             use = False  # held, and used already

@@ -197,7 +197,7 @@ class Controller(Node):
         try:
             stamp, position, velocity = wire.joints(message)
         except wire.MALFORMED:
-            self._malformed += 1
+            self._on_malformed(interface.JOINT_STATES)
             return
         reading = (position.get(ARM, math.nan), velocity.get(ROTOR, math.nan))
         other = self._armatures.pop(stamp, None)
@@ -210,13 +210,17 @@ class Controller(Node):
         try:
             stamp, *reading = wire.armature(message)
         except wire.MALFORMED:
-            self._malformed += 1
+            self._on_malformed(interface.ARMATURE)
             return
         other = self._joints.pop(stamp, None)
         if other is None:
             _keep(self._armatures, stamp, reading)
         else:
             self._on_sample(stamp, *other, *reading)
+
+    def _on_malformed(self, topic: str) -> None:
+        self._malformed += 1
+        self._log_fault(f"{topic}: a message cannot be read, or its stamp is no time: ignored")
 
     def _on_sample(self, stamp: int, theta: float, omega: float, i_a: float, v_a: float, applied: float) -> None:
         start = time.monotonic_ns()
@@ -227,8 +231,8 @@ class Controller(Node):
         if duty is not None:
             self._publisher.publish(wire.float64(duty))
             self._longest_ns = max(self._longest_ns, time.monotonic_ns() - start)
-        if supervisor.fault:
-            self._log_fault(supervisor.fault)
+        for said in filter(None, (supervisor.fault, supervisor.doubt)):
+            self._log_fault(said)
 
     def _on_reference(self, message: Float64) -> None:
         supervisor = self._supervisor

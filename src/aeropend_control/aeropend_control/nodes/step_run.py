@@ -32,6 +32,7 @@ from aeropend_control.nodes import wire
 from aeropend_control.nodes.excite import ProgressShow
 from aeropend_sim.cli.command import Parser
 from aeropend_sim.errors import UserError
+from aeropend_sim.readings import MOST
 from aeropend_sim.ros import interface
 from aeropend_sim.ros.program import run
 from aeropend_sim.ros.usage import EXIT_CODES
@@ -250,7 +251,8 @@ def _columns(joints: Sequence[bytes], armatures: Sequence[bytes], references: Se
             rows[stamp][2:] = reading
     stamps = np.array(sorted(rows), dtype=np.int64)
     table = np.array([rows[stamp] for stamp in stamps.tolist()])
-    read = dict(zip(step_report.COLUMNS[2:], table.T, strict=True))
+    read = {name: np.where(np.abs(x) <= MOST[name], x, np.nan)
+            for name, x in zip(step_report.COLUMNS[2:], table.T, strict=True)}
     grid, columns, lost = step_report.on_grid(1e-9 * (stamps - stamps[0]), read)
     starts = 1e-9 * (np.array([stamp for stamp, _ in references]) - int(stamps[0]))
     levels = np.array([level for _, level in references])

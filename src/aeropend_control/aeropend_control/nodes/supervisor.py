@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from aeropend_control.laws.law import Law
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 from aeropend_sim.model.rig import Sample
+from aeropend_sim.readings import is_possible
 
 LOST = Sample(math.nan, math.nan, math.nan, math.nan)
 """The sample that a law gets for a lost one."""
@@ -28,8 +29,9 @@ class Supervisor:
         reference: current reference; NaN before the first.
         duty: the last duty sent.
         fault: why the duty is 0 or has no effect, in one line; "" without a fault.
+        doubt: which reading of the last sample is no possible number, in one line; "" without one.
         refusal: why the last reference was refused; "" if it was accepted.
-        counts: number of faults of each kind, and of `samples`, `lost`, `repeated` and `refused`.
+        counts: number of faults of each kind, and of `samples`, `lost`, `repeated`, `refused` and `impossible`.
     """
 
     def __init__(self, law: Law, *, angle_limit: float, low: float, high: float, unit: str = "rad",
@@ -49,8 +51,8 @@ class Supervisor:
         self.law, self.angle_limit, self.low, self.high, self.unit = law, angle_limit, low, high, unit
         self.period, self.timeout = period, timeout
         self._measures = [Sample._fields.index(name) for name in dict.fromkeys(["theta", *measures])]
-        self.reference, self.duty, self.fault, self.refusal = math.nan, 0.0, "", ""
-        self.counts = Counter(dict.fromkeys(("samples", "lost", "repeated", "refused"), 0))
+        self.reference, self.duty, self.fault, self.refusal, self.doubt = math.nan, 0.0, "", "", ""
+        self.counts = Counter(dict.fromkeys(("samples", "lost", "repeated", "refused", "impossible"), 0))
         self._fault_kind = ""
         self._stamp: int | None = None
         self._applied = 0.0
@@ -72,7 +74,7 @@ class Supervisor:
 
     def note_applied(self, duty: float) -> None:
         """Process the duty [0..1] that the rig reports as applied; call it for each sample that reports one."""
-        self._applied = duty if math.isfinite(duty) else 0.0
+        self._applied = duty if is_possible("duty", duty) else 0.0
         if duty > 0.0:
             self._without_effect = 0
         elif self.duty > LEAST_DUTY:
@@ -97,8 +99,17 @@ class Supervisor:
         if not self._is_new(stamp_ns):
             return None
         self.counts["samples"] += 1
-        self.duty = self._duty_for(sample)
+        self.duty = self._duty_for(self._possible(sample))
         return self.duty
+
+    def _possible(self, sample: Sample) -> Sample:
+        """A sample with NaN where a reading is no possible number: the law bridges it as a missing one."""
+        wrong = [name for name, x in zip(Sample._fields, sample) if not (math.isnan(x) or is_possible(name, x))]
+        self.doubt = f"{' and '.join(wrong)} of a sample is no possible number: left out" if wrong else ""
+        if not wrong:
+            return sample
+        self.counts["impossible"] += 1
+        return sample._replace(**dict.fromkeys(wrong, math.nan))
 
     def _is_new(self, stamp_ns: int) -> bool:
         """Whether this sample is new. The law gets `LOST` for each sample lost before it."""

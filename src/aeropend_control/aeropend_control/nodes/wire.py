@@ -9,6 +9,8 @@ from __future__ import annotations
 import struct
 from typing import NamedTuple
 
+from aeropend_sim.readings import is_time
+
 _HEAD = {order: struct.Struct(order + "iII") for order in "<>"}  # stamp, length of frame_id
 _COUNT = {order: struct.Struct(order + "I") for order in "<>"}
 _BATTERY = {order: struct.Struct(order + "7f") for order in "<>"}
@@ -16,7 +18,7 @@ _FLOAT64 = struct.Struct("<4xd")
 _S = 1_000_000_000
 
 MALFORMED = (struct.error, ValueError, IndexError)
-"""Exceptions of the reading functions for a malformed message."""
+"""Exceptions of the reading functions for a malformed message, or one whose stamp is no time."""
 
 
 class Joints(NamedTuple):
@@ -40,7 +42,7 @@ def joints(message: bytes) -> Joints:
     """Read a serialized `sensor_msgs/msg/JointState`.
 
     Raises:
-        MALFORMED: it ends early, or is not plain CDR.
+        MALFORMED: it ends early, is not plain CDR, or its stamp is no time.
     """
     order = _order(message)
     count = _COUNT[order].unpack_from
@@ -63,25 +65,25 @@ def joints(message: bytes) -> Joints:
             at += (4 - at) % 8
         read.append(dict(zip(names, struct.unpack_from(f"{order}{number}d", message, at), strict=False)))
         at += 8 * number
-    return Joints(seconds * _S + nanoseconds, *read)
+    return Joints(_time(seconds, nanoseconds), *read)
 
 
 def armature(message: bytes) -> Armature:
     """Read a serialized `sensor_msgs/msg/BatteryState`.
 
     Raises:
-        MALFORMED: it ends early, or is not plain CDR.
+        MALFORMED: it ends early, is not plain CDR, or its stamp is no time.
     """
     order = _order(message)
     seconds, nanoseconds, length = _HEAD[order].unpack_from(message, 4)
     voltage, _, current, _, _, _, percentage = _BATTERY[order].unpack_from(message, _aligned(16 + length))
-    return Armature(seconds * _S + nanoseconds, current, voltage, percentage)
+    return Armature(_time(seconds, nanoseconds), current, voltage, percentage)
 
 
 def stamp_ns(message: bytes) -> int:
     """[ns] Stamp of a serialized message that begins with a header."""
     seconds, nanoseconds, _ = _HEAD[_order(message)].unpack_from(message, 4)
-    return int(seconds) * _S + int(nanoseconds)
+    return _time(seconds, nanoseconds)
 
 
 def float64(value: float) -> bytes:
@@ -90,6 +92,13 @@ def float64(value: float) -> bytes:
     _FLOAT64.pack_into(out, 0, value)
     out[1] = 1  # little-endian CDR
     return bytes(out)
+
+
+def _time(seconds: int, nanoseconds: int) -> int:
+    """[ns] A stamp."""
+    if not is_time(seconds, nanoseconds):
+        raise ValueError("the stamp is no time")
+    return seconds * _S + nanoseconds
 
 
 def _order(message: bytes) -> str:

@@ -260,6 +260,7 @@ class Plant(RigInterface):
             "late ticks": pace.late if pace else 0,
             "lost ticks": self._lost,
             "refused commands": self.refused,
+            "clamped commands": self.clamped,
             "lateness max ms": pace.max_lateness_ns * 1e-6 if pace else 0.0,
             "lateness p99 ms": pace.percentile_ms(0.99) if pace else 0.0,
             "clock steps": self.clock_steps,

@@ -15,6 +15,7 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
+from aeropend_sim.readings import is_possible, is_time
 from aeropend_sim.ros import interface
 from aeropend_sim.ros.diagnostics import Diagnostics
 from aeropend_sim.ros.program import run
@@ -65,7 +66,7 @@ class Rotor:
         """
         passed = 0.0 if self._last_ns is None else 1e-9 * (stamp_ns - self._last_ns)
         self._last_ns = stamp_ns
-        if 0.0 < passed < PAUSE_S and math.isfinite(omega):
+        if 0.0 < passed < PAUSE_S and is_possible("omega", omega):
             self.angle = math.remainder(self.angle + passed * omega / self._slow, 2.0 * math.pi)
         return self.angle
 
@@ -97,11 +98,15 @@ class Pose(Node):
         arm, rotor = interface.JOINTS
         theta = dict(zip(message.name, message.position)).get(arm, math.nan)
         omega = dict(zip(message.name, message.velocity)).get(rotor, math.nan)
-        if not math.isfinite(theta):
+        if not is_possible("theta", theta):
             self._counts["without angle"] += 1
             return
+        stamp = message.header.stamp
+        if not is_time(stamp.sec, stamp.nanosec):
+            self._counts["malformed"] += 1
+            return
         self._due = now + self._pause_s
-        stamp_ns = interface.stamp_ns(message.header.stamp)
+        stamp_ns = interface.stamp_ns(stamp)
         angle = self._rotor.turn(stamp_ns, omega)
         self._publisher.publish(interface.joint_states_message(stamp_ns, theta, omega, rotor_angle=angle))
         self._counts["published"] += 1

@@ -10,6 +10,7 @@ from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool
 
+from aeropend_sim.readings import ROUNDING
 from aeropend_sim.ros import interface
 from aeropend_sim.ros.diagnostics import CpuShare
 from aeropend_sim.ros.realtime import CLOCK_STEP_NS, monotonic_to_ros_ns
@@ -29,6 +30,7 @@ class RigInterface(Node):
         enabled: whether commands act.
         lowest: the least duty: 0, or -1 for a bridge that drives the motor both ways.
         refused: number of commands that were not finite numbers.
+        clamped: number of commands beyond the limits.
         clock_steps: number of times that the system clock was set.
         to_ros_ns: [ns] system time minus the monotonic clock.
     """
@@ -40,6 +42,7 @@ class RigInterface(Node):
         self.enabled = True
         self.lowest = 0.0
         self.refused = 0
+        self.clamped = 0
         self.clock_steps = 0
         self.to_ros_ns = monotonic_to_ros_ns()
         self.cpu_share = CpuShare()
@@ -97,6 +100,11 @@ class RigInterface(Node):
             if self.refused == 1:
                 self.get_logger().warn(f"duty_command {message.data} refused; further ones are only counted")
             return
+        if not self.lowest - ROUNDING <= message.data <= 1.0 + ROUNDING:
+            self.clamped += 1
+            if self.clamped == 1:
+                self.get_logger().warn(f"duty_command {message.data:g} is outside {self.lowest:g} to 1: clamped (give "
+                                       "a fraction, not percent); further ones are only counted")
         # as the 32-bit float that `armature` reports, so that a recording holds exactly the duty that acted
         duty = ctypes.c_float(min(max(message.data, self.lowest), 1.0)).value
         with self.lock:
