@@ -194,3 +194,37 @@ def test_what_is_said_of_a_column_goes_before_what_is_guessed(tmp_path, capsys):
     recording = imported(tmp_path, path, "--accept", "--theta", "pot:0.264deg", "--zero", "512")
     np.testing.assert_allclose(recording.theta, np.radians(DRIVEN), atol=np.radians(0.14))
     np.testing.assert_allclose(recording.duty, PUSH / 100.0, atol=1e-6)
+
+
+@pytest.fixture
+def recorded(bags, tmp_path):
+    """A recording of 200 samples."""
+    return bags.write(tmp_path / "bag", bags.content(200))
+
+
+def changed(recorded, *words):
+    """The recording before and after an import with these options."""
+    assert main([str(recorded), str(recorded.with_name("new")), *words]) == 0
+    return read(recorded), read(recorded.with_name("new"))
+
+
+def test_a_recording_is_imported_with_another_unit_sign_and_place_of_its_channels(recorded):
+    before, after = changed(recorded, "--theta", "theta:deg", "--flip", "--current", "v_a:-1mA", "--voltage", "i_a:V")
+    np.testing.assert_allclose(after.theta, -np.radians(before.theta), rtol=1e-12)
+    np.testing.assert_allclose(after.i_a, -1e-3 * before.v_a, rtol=1e-6)
+    for name, same in (("v_a", before.i_a), ("omega", before.omega), ("duty", before.duty), ("t", before.t)):
+        np.testing.assert_allclose(getattr(after, name), same, rtol=1e-6, err_msg=name)
+    assert after.reference.tolist() == [-0.4]
+
+
+def test_a_duty_in_percent_becomes_a_fraction(bags, tmp_path):
+    duty = np.linspace(0.0, 80.0, 200)
+    before = bags.write(tmp_path / "bag", bags.content(200, columns={"duty": duty}))
+    assert main([str(before), str(tmp_path / "new"), "--duty", "duty:%"]) == 0
+    np.testing.assert_allclose(read(tmp_path / "new").duty, duty / 100.0, rtol=1e-6)
+
+
+def test_a_recording_is_imported_only_to_change_something(recorded, capsys):
+    for words in ([recorded], [recorded, recorded.with_name("new")]):
+        assert "is a recording already: name what to change" in refused(capsys, *words)
+    assert not recorded.with_name("new").exists()

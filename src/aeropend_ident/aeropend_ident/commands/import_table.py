@@ -24,6 +24,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as Shown
 
+from aeropend_ident.bags.reading import RecordingError
+from aeropend_ident.tables import bag as of_bag
 from aeropend_ident.tables import files
 from aeropend_ident.tables.clock import CLOCKS
 from aeropend_ident.tables.guess import Given, Guess, guess, is_obvious, option, options
@@ -50,6 +52,8 @@ examples:
   import adc.npy my_bag --rate 490 --theta 1:counts:1024 --zero 512 --flip
   import rig.csv my_bag --time t:s --theta y:rad --duty u:V --supply 12V --both-ways reverse
   import angle.csv my_bag --with voltage.csv --accept --supply 12V
+  import my_bag mended --theta theta:deg --flip       a recording whose angle is in degrees, with the wrong sign
+  import my_bag mended --current v_a:A --voltage i_a:V                     one with two columns in the wrong place
 
 COLUMN is the name of a column in the file, or its number, from 1. A unit may have a factor: `--theta pot:54deg` if one
 volt is 54 degrees, `--current adc:-4.9mA`. With several files, each becomes a recording in the folder given last.
@@ -63,7 +67,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         prog="import", usage="import FILE [FILE ...] BAG [--time COLUMN:UNIT] [--theta COLUMN:UNIT] [options]",
         epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Convert a table to a recording: CSV, TSV, text, Excel (.xlsx), MATLAB (.mat), NumPy (.npy, .npz). "
-                    "Time stamps that are late, rounded,\nrepeated or wrapped are repaired; the repairs are listed.")
+                    "A recording\nis converted too, to change the unit, sign, zero or place of a channel: t, theta, "
+                    "omega, i_a, v_a, duty, reference.\nTime stamps that are late, rounded, repeated or wrapped are "
+                    "repaired; the repairs are listed.")
     parser.add_argument("paths", nargs="+", metavar="FILE",
                         help="the table, then the recording to write (BAG); for several tables, a folder of recordings")
     columns = parser.add_argument_group("meaning of the columns (COLUMN or COLUMN:UNIT)")
@@ -93,6 +99,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     more.add_argument("--clock", choices=CLOCKS, default="auto",
                       help="even: the rows are evenly spaced and the stamps are not exact; stamps: every stamp is "
                            "right; auto: choose by the data and report why")
+    more.add_argument("--namespace", metavar="NS", help="namespace of the rig, if FILE is a recording of several")
     more.add_argument("--sheet", metavar="NAME", help="sheet of a workbook with several tables")
     more.add_argument("--delimiter", type=_delimiter, metavar="MARK", help="between cells: , ; tab blank or another")
     more.add_argument("--decimal", choices=(".", ","), metavar="MARK", help="decimal mark: . or ,")
@@ -168,7 +175,13 @@ def run(given: argparse.Namespace, arguments: Sequence[str]) -> int:
             with progress(f"reading {printable(file.name)}") as show:
                 table = _read(file, given)
                 now, unsure, said = plan, "", plan.columns()
-                if given.accept or not said:
+                if of_bag.is_recording(file):
+                    if bag is None or not (said or plan.flip or plan.zero or plan.motor_off):
+                        raise TableError(f"{file}: is a recording already: name what to change, and the recording to "
+                                         f"make, as in import {file} NEW --theta theta:deg")
+                    now = replace(plan, **cast("dict[str, Any]", of_bag.options(table, said)),
+                                  clock="stamps" if plan.clock == "auto" else plan.clock)
+                elif given.accept or not said:
                     found = [Guess(why="as you say") if one.quantity in said else one
                              for one in guess(table, Given(plan.supply is not None, bool(plan.both_ways)))]
                     chosen = {**options(table, found), **said}
@@ -184,7 +197,7 @@ def run(given: argparse.Namespace, arguments: Sequence[str]) -> int:
                 show(0.0, f"writing {printable(bag.name)}")
                 with _put_aside(bag):
                     write(bag, taken, about(file, arguments, taken), show)
-        except (TableError, BagExistsError) as error:
+        except (TableError, BagExistsError, RecordingError) as error:
             ready = f" ({counted(done, 'recording')} before it {'is' if done == 1 else 'are'} made)" if done else ""
             raise TableError(f"{error}{ready}") from None
         except OSError as error:
@@ -212,6 +225,8 @@ def _put_aside(bag: Path) -> Iterator[None]:
 
 def _read(file: Path, given: argparse.Namespace) -> Table:
     """The table of a file, and of those that belong to it."""
+    if of_bag.is_recording(file):
+        return of_bag.read(file, given.namespace)
     first, *others = [files.read(path, sheet=given.sheet, delimiter=given.delimiter, decimal=given.decimal)
                       for path in (file, *map(Path, given.others))]
     return join([first, *others]) if others else first
