@@ -50,13 +50,12 @@ def test_a_good_recording_is_ok(path):
 
 
 @pytest.mark.parametrize(("change", "level", "words"), [
-    (lambda r: {"theta": r.theta * 180.0 / np.pi}, "warning", "imported with a wrong unit"),
-    (lambda r: {"theta": -r.theta}, "warning", "its sign may be wrong"),
+    (lambda r: {"theta": r.theta * 180.0 / np.pi}, "warning", "`import BAG NEW --theta theta:deg` mends it"),
+    (lambda r: {"theta": -r.theta}, "warning", "`import BAG NEW --flip` mends it"),
     (lambda r: {"theta": np.roll(r.theta, len(r) // 2)}, "warning", "hardly follows the duty"),
-    (lambda r: {"theta": r.theta + 0.4}, "warning", "at rest without duty the angle is 0.4 rad"),
+    (lambda r: {"theta": r.theta + 0.4}, "warning", "`import BAG NEW --zero start` mends it"),
     (lambda r: {"theta": r.theta * 1e-3}, "warning", "the arm hardly moves"),
     (lambda r: {"theta": np.full(len(r), np.nan)}, "error", "no arm angle"),
-    (lambda r: {"duty": 100.0 * r.duty}, "error", "is a fraction, -1 to 1: import it again with its unit"),
     (lambda r: {"duty": np.full(len(r), 0.3)}, "warning", "the duty stays at 0.3"),
     (lambda r: {"duty": np.full(len(r), np.nan), "v_a": np.full(len(r), np.nan)}, "warning", "only a free decay"),
     (lambda r: {"t": 0.5 * r.t}, "warning", "only 16 s long"),

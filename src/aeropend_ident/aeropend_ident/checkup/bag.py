@@ -13,6 +13,7 @@ from aeropend_ident.bags.recording import Recording, RecordingError
 from aeropend_ident.checkup.check import Check, error, ok, warning
 from aeropend_ident.identification import dataset
 from aeropend_ident.identification.excitation_quality import quality
+from aeropend_ident.signals import mistakes
 from aeropend_ident.signals.from_bag import as_signals
 from aeropend_ident.signals.signals import STILL
 from aeropend_ident.signals.smoothing import lag
@@ -21,9 +22,6 @@ from aeropend_sim.wording import counted
 
 FEW_LOST = 0.01
 """Share of lost samples up to which nothing is said but their number (choice)."""
-
-TURNS = 4.0 * math.pi
-"""[rad] Range of the angle from which it is not in rad (choice: an aeropendulum makes no two turns)."""
 
 SMALL = 0.02
 """[rad] Range of the angle below which it shows nothing, or has another unit (choice)."""
@@ -62,6 +60,8 @@ def checks(path: str, model: Model, namespace: str | None = None) -> Iterator[Ch
     rate = f", {1.0 / read.period:.4g} samples/s" if read.period > 0.0 else ""
     yield ok(path, f"{counted(len(read), 'sample')}, {read.duration:.1f} s{rate}, "
              f"with {', '.join(read.channels) or 'no channel'}")
+    for note in read.notes:
+        yield ok(path, note)
     if not read.complete:
         yield warning(path, f"it was broken off or damaged: recover {path}")
     yield from contents(path, read)
@@ -92,7 +92,7 @@ def _samples(path: str, read: Recording) -> Iterator[Check]:
 
 
 def _duty(path: str, read: Recording) -> Iterator[Check]:
-    """The duty: there, within -1 to 1, moving."""
+    """The duty: there, moving."""
     known = read.duty[np.isfinite(read.duty)]
     if not len(known) and np.isfinite(read.v_a).any():
         yield ok(path, "no duty: the voltage takes its place (diagnose --uncalibrated, or a model with v_full)")
@@ -102,10 +102,7 @@ def _duty(path: str, read: Recording) -> Iterator[Check]:
                       "record armature or duty_command too")
         return
     low, high = float(known.min()), float(known.max())
-    if low < -1.0 or high > 1.0:
-        yield error(path, f"the duty goes from {low:.3g} to {high:.3g}, but is a fraction, -1 to 1: import it again "
-                    "with its unit")
-    elif high - low < STILL:
+    if high - low < STILL:
         yield warning(path, f"the duty stays at {high:.2g}: record while `excite` runs")
 
 
@@ -115,20 +112,18 @@ def _angle(path: str, read: Recording) -> Iterator[Check]:
     if not len(known):
         yield error(path, "no arm angle (joint_states, position of 'arm'): nothing can be diagnosed; record it")
         return
-    span = float(np.ptp(known))
-    if span > TURNS:
-        yield warning(path, f"the angle spans {span:.3g} rad, more than two turns: the arm went round, or the angle "
-                      "was imported with a wrong unit")
-    elif span < SMALL:
+    for one in mistakes.without_model(read.theta, read.duty, read.i_a, read.v_a):
+        yield warning(path, one.text)
+    if (span := float(np.ptp(known))) < SMALL:
         yield warning(path, f"the angle spans only {span:.2g} rad: the arm hardly moves, or it has another unit")
     rest = resting_angle(read)
     if rest is not None and abs(rest) > OFF_ZERO:
         yield warning(path, f"at rest without duty the angle is {rest:.2g} rad, where it should be 0: set the zero "
-                      "(calibrate, or import --zero)")
+                      f"(calibrate); {mistakes.mend('--zero start')} mends it")
     follows = following(read)
     if follows < -FOLLOWS:
-        yield warning(path, "the angle falls where the duty rises: its sign may be wrong; import it again with the "
-                      "other sign, or swap the sensor's wires")
+        yield warning(path, "the angle falls where the duty rises: if its sign is wrong, "
+                      f"{mistakes.mend('--flip')} mends it")
     elif abs(follows) < FOLLOWS:
         yield warning(path, "the angle hardly follows the duty: check that this duty drove the motor")
 

@@ -24,6 +24,7 @@ from aeropend_ident.bench_tests.estimates import BenchTestError, Estimate, Found
 from aeropend_ident.bench_tests.picture import scatter
 from aeropend_ident.bench_tests.table import read_rows
 from aeropend_ident.result_folder import atomic_folder, ensure_free
+from aeropend_ident.signals.from_bag import checked
 from aeropend_sim.cli.command import Parser, entry_point
 from aeropend_sim.model.parameters import PRESETS, Model, from_flat, load, save
 
@@ -185,19 +186,20 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     return options
 
 
-def source(path: str, columns: str | None, namespace: str | None) -> Source:
+def source(path: str, columns: str | None, namespace: str | None, base: Model) -> Source:
     """Read a table, or a recording: a folder, .mcap or .db3.
 
     Args:
         path: of the table or the recording.
         columns: names and units, for a table without a line of names.
         namespace: of the rig in the recording.
+        base: model with the other parameters.
 
     Raises:
         BenchTestError, RecordingError: it cannot be used.
     """
     if Path(path).is_dir() or Path(path).suffix in {".mcap", ".db3"}:
-        read = recording.read(path, namespace)
+        read = checked(recording.read(path, namespace), base)
         return replace(read, path=Path(path).name)
     return read_rows(Path(path), columns)
 
@@ -212,7 +214,7 @@ def run(options: argparse.Namespace) -> None:
     ensure_free(out, FILES, overwrite=options.overwrite)
     base = load(options.model)
     given = {name: getattr(options, name.replace("-", "_")) for name in TESTS}
-    read = {path: source(path, options.columns, options.namespace) for path in set(given.values()) if path}
+    read = {path: source(path, options.columns, options.namespace, base) for path in set(given.values()) if path}
     found = work_out({name: read[path] for name, path in given.items() if path}, base)
     model = augmented(base, found)
     command = "bench_test " + " ".join(f"--{name} {Path(path).name}" for name, path in given.items() if path)

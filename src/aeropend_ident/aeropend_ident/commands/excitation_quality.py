@@ -13,10 +13,12 @@ from collections.abc import Sequence
 from aeropend_ident.bags import recording
 from aeropend_ident.identification import dataset
 from aeropend_ident.identification.excitation_quality import planned, quality
+from aeropend_ident.signals.from_bag import checked
 from aeropend_sim.cli.command import EXIT_CODES, Parser, entry_point
 from aeropend_sim.cli.progress import progress
 from aeropend_sim.model.excitation import KINDS, Excitation
 from aeropend_sim.model.parameters import PRESETS, load
+from aeropend_sim.untrusted import printable
 
 EXAMPLES = f"""examples:
   excitation_quality --duration 20 --duty-max 0.3        a signal of `excite`, before it is recorded
@@ -51,12 +53,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     model = load(options.model)
     with progress("reading") as show:
         if options.bag:
-            data = dataset.from_bag(recording.read(options.bag, options.namespace), model.sensing, held_out=0.0)
+            read = checked(recording.read(options.bag, options.namespace), model)
+            data = dataset.from_bag(read, model.sensing, held_out=0.0)
         else:
             signal = Excitation(options.kind, options.duration, options.seed, options.duty_min, options.duty_max,
                                 options.hold_min, options.hold_max, rest=options.rest)
             data = planned(model, signal.series())
         found = quality(model, data, show)
+    for note in data.notes:
+        print(printable(f"note: {note}"))
     for one in found:
         remark = "poorly excited" if one.poor else ""
         if one.rivals:

@@ -21,6 +21,7 @@ from aeropend_ident.identification.identify import METHODS, Identified, identify
 from aeropend_ident.identification.output_error_selection import STABLE
 from aeropend_ident.identification.sindy import DERIVATIVES
 from aeropend_ident.result_folder import atomic_folder, ensure_free, folder_names
+from aeropend_ident.signals.from_bag import checked
 from aeropend_sim.cli.command import Parser, between, entry_point
 from aeropend_sim.cli.progress import progress
 from aeropend_sim.model.parameters import PRESETS, load
@@ -127,8 +128,8 @@ def run(options: argparse.Namespace) -> None:
     model = load(options.model)
     known = nominal(model) if options.method.startswith("discrepancy") else None
     with progress("reading") as show:
-        data = dataset.from_bag(recording.read(options.bag, options.namespace), model.sensing, _listed(options.states),
-                                _listed(options.input), options.held_out)
+        read = checked(recording.read(options.bag, options.namespace), model)
+        data = dataset.from_bag(read, model.sensing, _listed(options.states), _listed(options.input), options.held_out)
         found, traces = identify_with_traces(data, options.method,
                                              None if options.terms is None else _listed(options.terms), known,
                                              options.derivative, show)

@@ -20,6 +20,7 @@ from aeropend_control.laws.registry import LAWS
 from aeropend_ident.bags.recording import Recording, read
 from aeropend_ident.result_folder import OutputError
 from aeropend_sim.cli.command import EXIT_CODES, Parser, entry_point
+from aeropend_sim.untrusted import printable
 
 SHORTEST_S = 1.0
 """A last step held for less is left out: recordings end at any time."""
@@ -106,6 +107,8 @@ def run(options: argparse.Namespace) -> None:
         except OSError as error:
             raise OutputError(f"{options.plot} cannot be written: {error.strerror}") from None
     console = Console(width=None if sys.stdout.isatty() else 120)
+    for note in recording.notes:
+        print(printable(f"note: {note}"))
     console.print(step_report.table({options.law: described}, {options.law: kind.reference_unit}))
 
 

@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from aeropend_ident.bags import recording
 from aeropend_ident.bags.recording import Recording, RecordingError
+from aeropend_ident.signals import mistakes
 from aeropend_ident.signals.free_decay import degrees, free_decay
 from aeropend_ident.signals.grid import check_period, irregular_grid, longest_piece, regular_grid
-from aeropend_ident.signals.noise import reading_noise_at
-from aeropend_ident.signals.outliers import joined_turns
+from aeropend_ident.signals.noise import reading_noise_at, white_noise_at
+from aeropend_ident.signals.outliers import joined_turns, jumps_out
 from aeropend_ident.signals.pulses import hold
 from aeropend_ident.signals.signals import CHANNELS, MINIMUM_DURATION, STILL, Signals, from_arrays
 from aeropend_sim.model.parameters import Model
@@ -52,6 +53,9 @@ MOVES = 3.0
 
 Measured: at ±30 % no verdict of 5 recordings changes (docs/results/thresholds.md)."""
 
+
+MOST_MISSING = 100
+"""Greatest ratio of missing samples to samples with which a recording is simulated (choice; it bounds the memory)."""
 
 BACKWARDS = 0.02
 """Voltage of the other sign, over the largest, that is no drive in both directions (choice: an offset)."""
@@ -97,10 +101,36 @@ def as_signals(read: Recording, model: Model, held_out: float = 0.3, *, fit_nomi
     if not fit_nominal:
         check_period(read)
         piece = longest_piece(with_voltage_as_command(read, model.model["v_full"]) if model.model["v_full"] else read)
-        return from_recording(piece, model.sensing, held_out)
+        return from_recording(checked(piece, model), model.sensing, held_out)
     if len(read) < FEWEST:
         raise RecordingError(f"{read.path}: {len(read)} samples are too few for a verdict")
-    return from_uncalibrated(longest_piece(with_voltage_as_command(read)), model.sensing, held_out)
+    piece = longest_piece(with_voltage_as_command(read))
+    likely = mistakes.without_model(piece.theta, piece.duty, piece.i_a, piece.v_a)
+    piece = replace(piece, notes=(*piece.notes, *(one.text for one in likely)))
+    return from_uncalibrated(piece, model.sensing, held_out)
+
+
+def checked(read: Recording, model: Model) -> Recording:
+    """A recording of a calibrated rig, with a note on each likely mistake of its units, signs, zero and columns.
+
+    Args:
+        read: the recording.
+        model: the nominal model.
+
+    Raises:
+        RecordingError: a mistake is sure: no result could be right.
+    """
+    piece = longest_piece(read)
+    if not piece.period > 0.0 or piece.duration > MOST_MISSING * len(piece) * piece.period:
+        return read
+    index, period = regular_grid(piece)
+    columns = _columns(piece, index)
+    if not np.isfinite(columns["duty"]).any():
+        return read
+    likely = mistakes.found(columns, hold(columns["duty"]), period, model)
+    if sure := [one for one in likely if one.sure]:
+        raise RecordingError(f"{read.path}: {sure[0].text}")
+    return replace(read, notes=(*read.notes, *(one.text for one in likely)))
 
 
 def _driven_backward(read: Recording, *, reverses: bool) -> Recording:
@@ -185,11 +215,11 @@ def from_uncalibrated(read: Recording, sensing: Mapping[str, float], held_out: f
     index, period = irregular_grid(read.stamp_ns, LONGEST_PERIOD if driven and alone else math.inf)
     columns = _columns(read, index)
     t = (read.stamp_ns - read.stamp_ns[0]) * 1e-9
-    sigma = {"theta": reading_noise_at(t, read.theta)}
+    sigma = {"theta": _reading_noise(t, read.theta)}
     for name in ("i_a", "v_a", "omega"):
         x = getattr(read, name)
         if np.isfinite(x).sum() > 10:
-            sigma[name] = reading_noise_at(t, x)
+            sigma[name] = _reading_noise(t, x)
     own = _own_sensing(read, sensing)
     duty = columns["duty"]
     idle = not np.isfinite(duty).any() or bool(np.nanmax(np.abs(duty)) < STILL)
@@ -267,6 +297,11 @@ def _columns(read: Recording, index: np.ndarray) -> dict[str, np.ndarray]:
         columns[name] = np.full(int(index[-1]) + 1, np.nan)
         columns[name][index] = getattr(read, name)
     return columns
+
+
+def _reading_noise(t: Array, x: Array) -> float:
+    """Standard deviation of a reading (N,) at t (N,) [s]; single readings that jump out do not count."""
+    return reading_noise_at(t, np.where(jumps_out(x, white_noise_at(t, x)), np.nan, x))
 
 
 def _own_sensing(read: Recording, sensing: Mapping[str, float]) -> dict[str, float]:

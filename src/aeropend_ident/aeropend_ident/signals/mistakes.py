@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Likely mistakes of units, signs, zero and columns in a recording, by physics: what gravity, lift and the motor allow.
+
+The model is simulated with the duty of the recording. A reading in another unit follows its simulation at the ratio of
+the units, one with the wrong sign goes against it, and that of another column follows the simulation of that one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import Model
+from aeropend_sim.model.rig import record
+
+Array = NDArray[np.float64]
+
+TURNS = 4.0 * math.pi
+"""[rad] Range of an angle from which it is not in rad (choice: an aeropendulum makes no two turns)."""
+
+RARE = (1.0, 99.0)
+"""Percentiles between which readings are for their range (choice: single false readings do not count)."""
+
+ABSURD = 100.0
+"""Ratio of the range of speed, current or voltage to the simulated one from which no result can be right (choice)."""
+
+FASTEST = 100.0
+"""[rad/s] Speed that no arm reaches (choice: 16 turns a second)."""
+
+SINGLE = 7
+"""Readings of which the middle one is taken, so that single false ones are no jumps (choice)."""
+
+OFF_ZERO = 0.25
+"""[rad] Zero of the angle, beside the simulated one, from which it is said (choice: a smaller one is an effect)."""
+
+ZERO = CATALOGUE["angle_offset"].parameters["bias"].high
+"""[rad] Zero of the angle beyond which no effect is looked for (derived: the range of `angle_offset`)."""
+
+FOLLOWS = 0.8
+"""Least correlation of a reading with its simulation to compare their sizes.
+
+Measured: of 60 healthy rigs of the blind check the least is 0.99, of 60 with an effect one has less than 0.8, with many
+false speeds. No mistake is seen in any of the 120; of 12 mistakes made in each healthy one none is missed; that duty
+and current are exchanged is missed in 4 of 60."""
+
+CLOSE = 1.5
+"""Ratio by which a unit may miss the ratio of reading and simulation (choice: a model may be as wrong)."""
+
+OPPOSITE = 3.0
+"""Likewise of a reading with the wrong sign, whose size matters less (choice)."""
+
+FITS, BETTER = 0.5, 2.0
+"""Error of a reading beside the simulation of another column, in standard deviations of it, at which it may be that
+column, and the ratio by which it must be below the error beside its own (choice)."""
+
+EXCHANGED = 10.0
+"""Ratio of what the duty does not explain of the voltage to what it does not explain of the current above which the two
+are exchanged.
+
+Derived: the bridge makes the voltage from the duty; the current depends on the speed too. Measured: of 120 rigs of the
+blind check the largest is 0.3, of a long delay."""
+
+STILL = 0.01
+"""Width of the levels of the duty (choice)."""
+
+LEAST = 100
+"""Readings with which a channel is compared (choice)."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit that somebody may have sent instead of that of docs/interfaces.md.
+
+    Attributes:
+        name: as `import` knows it.
+        ratio: its number for 1 of the right unit.
+        sure: whether no rig with the right unit reads as much.
+    """
+
+    name: str
+    ratio: float
+    sure: bool = True
+
+
+UNITS = {
+    "theta": (Unit("deg", 180.0 / math.pi), Unit("turn", 1.0 / math.tau)),
+    "omega": (Unit("rpm", 60.0 / math.tau, sure=False), Unit("turn/s", 1.0 / math.tau, sure=False),
+              Unit("deg/s", 180.0 / math.pi, sure=False)),
+    "i_a": (Unit("mA", 1e3),),
+    "v_a": (Unit("mV", 1e3),),
+}
+OWN = {"theta": "rad", "omega": "rad/s", "i_a": "A", "v_a": "V"}
+NAMES = {"theta": "angle", "omega": "speed", "i_a": "current", "v_a": "voltage"}
+OPTIONS = {"theta": "theta", "omega": "omega", "i_a": "current", "v_a": "voltage"}
+"""Channel -> option of `import`."""
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """A likely mistake: what it looks like with the command that mends it, and whether no verdict can be right."""
+
+    text: str
+    sure: bool
+
+
+def mend(*options: str) -> str:
+    """The command that mends it with these options of `import`."""
+    return f"`import BAG NEW {' '.join(options)}`"
+
+
+def without_model(theta: Array, duty: Array, i_a: Array, v_a: Array) -> list[Mistake]:
+    """Mistakes that show whatever the parameters of the rig are.
+
+    Args:
+        theta: [rad] (N,) angle, NaN where missing; likewise:
+        duty: (N,) duty.
+        i_a: [A] (N,) armature current.
+        v_a: [V] (N,) armature voltage.
+    """
+    out = []
+    known = theta[np.isfinite(theta)]
+    span = _span(known) if len(known) else 0.0
+    if span > TURNS:
+        out.append(Mistake(f"the angle spans {span:.3g} rad, more than two turns: if it is in degrees, "
+                           f"{mend('--theta theta:deg')} mends it", sure=False))
+    of_voltage, of_current = (_beside_duty(x, duty) for x in (v_a, i_a))
+    if of_voltage > EXCHANGED * of_current:
+        out.append(replace(_exchanged("i_a", "v_a", "the current depends on the duty alone, the voltage does not"),
+                           sure=False))
+    return out
+
+
+def _beside_duty(x: Array, duty: Array) -> float:
+    """Share of the variance of a reading (N,) that no function of the duty (N,) explains; NaN if it is not measured."""
+    both = np.isfinite(x) & np.isfinite(duty)
+    y = x[both]
+    if len(y) < LEAST or np.ptp(y) == 0.0 or np.ptp(duty[both]) < STILL:
+        return math.nan
+    _, level = np.unique(np.round(duty[both] / STILL), return_inverse=True)
+    mean = np.bincount(level, y) / np.bincount(level)
+    return float(np.var(y - mean[level]) / np.var(y))
+
+
+def found(readings: Mapping[str, Array], duty: Array, period: float, model: Model) -> list[Mistake]:
+    """Mistakes in the readings of a calibrated rig.
+
+    Args:
+        readings: channel -> (N,) on a uniform grid, NaN where missing.
+        duty: (N,) -1 to 1, held where a sample is missing.
+        period: [s] of the grid.
+        model: the nominal model.
+    """
+    if not np.isfinite(duty).all() or len(duty) < LEAST:
+        return []
+    simulated = record(model, duty, period=period)[0]
+    if (name := _exchanged_with_duty(readings, duty, period, model, simulated)) is not None:
+        options = mend(f"--duty {name}:1", f"--{OPTIONS[name]} duty:{OWN[name]}")
+        return [Mistake(f"it looks as if duty and {NAMES[name]} are exchanged (the rig follows {name} as its duty): "
+                        f"{options} mends it", sure=True)]
+    pairs = {}
+    for name in OWN:
+        x, y = simulated[name], readings[name]
+        both = np.isfinite(x) & np.isfinite(y)
+        if both.sum() >= LEAST and np.ptp(x[both]) > 0.0 and np.ptp(y[both]) > 0.0:
+            pairs[name] = x[both], y[both]
+    twos = [two for two in combinations(pairs, 2) if _are_exchanged(readings, simulated, *two)]
+    out: list[Mistake | None] = [_exchanged(a, b, f"{a} fits the simulated {b}, {b} the simulated {a}")
+                                 for a, b in twos]
+    driven = np.ptp(duty) >= STILL
+    for name, pair in pairs.items():
+        if not any(name in two for two in twos):
+            out.append(_of_channel(name, *pair) or (_absurd(name, *pair) if driven else None))
+    if not any(out):
+        out.append(_slipped(readings["theta"], period))
+    return [one for one in out if one is not None]
+
+
+def _exchanged_with_duty(readings: Mapping[str, Array], duty: Array, period: float, model: Model,
+                         simulated: Mapping[str, Array]) -> str | None:
+    """The column that is the duty, whose own readings are in the column of the duty; None if the duty is right."""
+    own = _largest_error(readings, simulated)
+    for name in OWN:
+        x = readings[name]
+        if not np.isfinite(x).all() or np.abs(x).max() > 1.0 or np.ptp(x) < STILL:
+            continue
+        other = record(model, x, period=period)[0]
+        if _largest_error({**readings, name: duty}, other) < min(FITS, own / BETTER):
+            return name
+    return None
+
+
+def _largest_error(readings: Mapping[str, Array], simulated: Mapping[str, Array]) -> float:
+    """The error of the channel that follows its simulation worst, of those that were measured."""
+    return max((e for c in OWN if not math.isnan(e := _error(readings[c], simulated[c]))), default=math.nan)
+
+
+def _are_exchanged(readings: Mapping[str, Array], simulated: Mapping[str, Array], a: str, b: str) -> bool:
+    """Whether two columns fit the simulations of each other, and not their own."""
+    return all(_error(readings[x], simulated[y]) < min(FITS, _error(readings[x], simulated[x]) / BETTER)
+               for x, y in ((a, b), (b, a)))
+
+
+def _error(y: Array, x: Array) -> float:
+    """RMS of a reading (N,) minus a simulation (N,), in standard deviations of the simulation."""
+    both = np.isfinite(x) & np.isfinite(y)
+    if not both.any():
+        return math.nan
+    return float(np.sqrt(np.mean((y[both] - x[both]) ** 2)) / max(float(np.std(x[both])), 1e-12))
+
+
+def _exchanged(a: str, b: str, why: str) -> Mistake:
+    options = mend(f"--{OPTIONS[a]} {b}:{OWN[a]}", f"--{OPTIONS[b]} {a}:{OWN[b]}")
+    return Mistake(f"it looks as if {NAMES[a]} and {NAMES[b]} are exchanged ({why}): {options} mends it", sure=True)
+
+
+def _slipped(theta: Array, period: float) -> Mistake | None:
+    """Whether an angle (N,) jumps to stay, faster than an arm turns."""
+    inner = slice(SINGLE // 2, -(SINGLE // 2))
+    known = np.flatnonzero(np.isfinite(theta))
+    if len(known) <= SINGLE:
+        return None
+    steps = np.diff(median_filter(theta[known], SINGLE)[inner])
+    known = known[inner]
+    jumps = np.flatnonzero(np.abs(steps) > np.maximum(FASTEST * period * np.diff(known), OFF_ZERO))
+    if not len(jumps):
+        return None
+    at = jumps[0]
+    return Mistake(f"the angle jumps by {steps[at]:.2g} rad at {known[at] * period:.1f} s, faster than any arm turns: "
+                   "its zero was set there, or it slipped; record again", sure=True)
+
+
+def _span(x: Array) -> float:
+    """Range of readings (N,) without rare ones."""
+    return float(np.ptp(np.percentile(x, RARE)))
+
+
+def _absurd(name: str, x: Array, y: Array) -> Mistake | None:
+    """Whether a reading (N,) of the motor has another size than any rig, beside its simulation (N,)."""
+    if name == "theta" or not _span(y) > ABSURD * _span(x) > 0.0:
+        return None
+    return Mistake(f"the {NAMES[name]} spans {_span(y):.3g} {OWN[name]}, {_span(y) / _span(x):.3g} times as far as in "
+                   "the model with the same duty: check its unit, or give the model file of the rig", sure=True)
+
+
+def _of_channel(name: str, x: Array, y: Array) -> Mistake | None:
+    """The mistake that the readings (N,) beside their simulation (N,) show."""
+    sx, sy = float(np.std(x)), float(np.std(y))
+    r = float(np.mean((x - x.mean()) * (y - y.mean()))) / (sx * sy)
+    if abs(r) < FOLLOWS:
+        return None
+    ratio = sy / sx * abs(r)
+    unit = next((u for u in UNITS[name] if 1.0 / CLOSE < ratio / u.ratio < CLOSE), None)
+    turned = r < 0.0
+    against = f"it goes {'against' if turned else 'with'} the simulated one, {ratio:.3g} times as far"
+    if unit is not None:
+        what = f"is in {unit.name}{' and turned over' * turned}"
+    elif turned and 1.0 / OPPOSITE < ratio < OPPOSITE:
+        what = "is turned over"
+    else:
+        zero = float(np.median(y - x))
+        if name == "theta" and not turned and 1.0 / CLOSE < ratio < CLOSE and abs(zero) > OFF_ZERO:
+            return Mistake(f"it looks as if the arm hung at a reading of {zero:.2f} rad, not 0: if it does, "
+                           f"{mend(f'--zero {zero:.2f}rad')} mends it", abs(zero) > ZERO)
+        return None
+    return Mistake(f"it looks as if the {NAMES[name]} {what} ({against}): {_of_unit(name, unit, turned=turned)} mends "
+                   "it", turned or (unit is not None and unit.sure))
+
+
+def _of_unit(name: str, unit: Unit | None, *, turned: bool) -> str:
+    text = OWN[name] if unit is None else unit.name
+    if name == "theta":
+        return mend(*[f"--theta theta:{text}"] * (unit is not None), *["--flip"] * turned)
+    return mend(f"--{OPTIONS[name]} {name}:{'-1' * turned}{text}")

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Mistaken units, signs, zeros and columns are recognised by physics, and the command that is said mends them."""
+
+import re
+import shlex
+
+import numpy as np
+import pytest
+
+from aeropend_ident.bags.recording import CHANNELS, RecordingError, read
+from aeropend_ident.commands import bench, excitation_quality, identify
+from aeropend_ident.commands.import_table import main as import_
+from aeropend_ident.signals import mistakes
+from aeropend_ident.signals.from_bag import as_signals
+from aeropend_ident.testing.bags import write
+from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
+from aeropend_sim.model import rig
+from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.parameters import SAMPLE_PERIOD
+
+PERIOD_NS = round(SAMPLE_PERIOD * 1e9)
+SURE = {
+    "degrees": lambda c: {"theta": np.degrees(c["theta"])},
+    "turned over": lambda c: {"theta": -c["theta"]},
+    "degrees, turned over": lambda c: {"theta": -np.degrees(c["theta"])},
+    "hangs at -90 degrees": lambda c: {"theta": c["theta"] - 0.5 * np.pi},
+    "mA": lambda c: {"i_a": 1e3 * c["i_a"]},
+    "mV": lambda c: {"v_a": 1e3 * c["v_a"]},
+    "current turned over": lambda c: {"i_a": -c["i_a"]},
+    "voltage turned over": lambda c: {"v_a": -c["v_a"]},
+    "speed turned over": lambda c: {"omega": -c["omega"]},
+    "current and voltage": lambda c: {"i_a": c["v_a"], "v_a": c["i_a"]},
+    "angle and speed": lambda c: {"theta": c["omega"], "omega": c["theta"]},
+    "duty and current": lambda c: {"duty": c["i_a"], "i_a": c["duty"]},
+    "percent": lambda c: {"duty": 100.0 * c["duty"]},
+}
+LIKELY = {
+    "rpm": lambda c: {"omega": c["omega"] * 60.0 / (2.0 * np.pi)},
+    "turns": lambda c: {"omega": c["omega"] / (2.0 * np.pi)},
+    "hangs at 0.4 rad": lambda c: {"theta": c["theta"] + 0.4},
+}
+
+
+def drawn(seed, effects=None, duration=5.0):
+    """Channels and duty of a rig that begins at rest."""
+    duty = np.concatenate([np.zeros(250), steps(duration, seed)])
+    return {**rig.record(drawn_rig(seed, effects or {}), duty, seed)[0], "duty": duty}
+
+
+@pytest.fixture(scope="module")
+def columns():
+    return drawn(31)
+
+
+def mended(said, bag):
+    """The recording that the command in this line makes."""
+    words = shlex.split(re.search(r"`import BAG NEW (.*?)`", said)[1])
+    assert import_([str(bag), str(bag.with_name("new")), *words]) == 0
+    return read(bag.with_name("new"))
+
+
+def alike(recording, columns):
+    for name in CHANNELS:
+        np.testing.assert_allclose(getattr(recording, name), columns[name], rtol=1e-6, atol=2e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("what", SURE)
+def test_a_sure_mistake_is_refused_with_the_command_that_mends_it(columns, tmp_path, what):
+    write(tmp_path / "bag", columns | SURE[what](columns), PERIOD_NS)
+    with pytest.raises(RecordingError) as refused:
+        as_signals(read(tmp_path / "bag"), BENCH)
+    new = mended(str(refused.value), tmp_path / "bag")
+    if what.startswith("hangs"):
+        np.testing.assert_allclose(new.theta, columns["theta"], atol=0.05)  # the nominal model is not the rig
+    else:
+        alike(new, columns)
+    assert as_signals(new, BENCH).notes == ()
+
+
+@pytest.mark.parametrize("what", LIKELY)
+def test_a_likely_mistake_is_a_note_with_the_command_that_mends_it(columns, tmp_path, what):
+    write(tmp_path / "bag", columns | LIKELY[what](columns), PERIOD_NS)
+    (said,) = (note for note in as_signals(read(tmp_path / "bag"), BENCH).notes if "it looks as if" in note)
+    new = mended(said, tmp_path / "bag")
+    np.testing.assert_allclose(new.theta, columns["theta"], atol=0.05)
+    np.testing.assert_allclose(new.omega, columns["omega"], atol=1e-4)
+
+
+@pytest.mark.parametrize("effect", [None, "speed_spikes", "encoder_lag", "command_delay", "angle_offset"])
+def test_a_rig_with_an_effect_has_no_mistake(effect):
+    for seed in range(3):
+        c = drawn(40 + seed, {effect: {}} if effect else {})
+        assert mistakes.found(c, c["duty"], SAMPLE_PERIOD, BENCH) == []
+        assert mistakes.without_model(c["theta"], c["duty"], c["i_a"], c["v_a"]) == []
+    assert effect is None or effect in CATALOGUE
+
+
+@pytest.mark.parametrize("channel", ["omega", "i_a", "v_a"])
+def test_a_size_that_no_rig_has_is_refused(columns, channel):
+    odd = columns | {channel: np.where(np.arange(len(columns["duty"])) % 2000 < 700, 1e3, 1.0) * columns[channel]}
+    (one,) = mistakes.found(odd, columns["duty"], SAMPLE_PERIOD, BENCH)
+    assert one.sure
+    assert "check its unit, or give the model file" in one.text
+
+
+def test_an_angle_whose_zero_is_set_while_it_is_recorded_is_refused(columns):
+    half = np.arange(len(columns["duty"])) > len(columns["duty"]) // 2
+    (one,) = mistakes.found(columns | {"theta": columns["theta"] + 3.0 * half}, columns["duty"], SAMPLE_PERIOD, BENCH)
+    assert one.sure
+    assert "the angle jumps by 3 rad at 2.8 s" in one.text
+    single = np.where(np.arange(len(half)) % 500 < 3, 9.0, columns["theta"])
+    assert mistakes.found(columns | {"theta": single}, columns["duty"], SAMPLE_PERIOD, BENCH) == []
+
+
+def test_of_an_uncalibrated_rig_degrees_and_exchanged_columns_are_a_note(columns, tmp_path):
+    changed = {"theta": np.degrees(columns["theta"]), "i_a": columns["v_a"], "v_a": columns["i_a"]}
+    write(tmp_path / "bag", columns | changed, PERIOD_NS)
+    notes = as_signals(read(tmp_path / "bag"), BENCH, fit_nominal=True).notes
+    assert any("`import BAG NEW --theta theta:deg` mends it" in note for note in notes)
+    assert any("`import BAG NEW --current v_a:A --voltage i_a:V` mends it" in note for note in notes)
+
+
+@pytest.mark.parametrize(("command", "words"), [
+    (identify.main, []), (excitation_quality.main, []), (bench.main, ["--steady"])])
+def test_every_command_with_a_model_says_it(columns, tmp_path, monkeypatch, capsys, command, words):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "bag", columns | {"i_a": -columns["i_a"]}, PERIOD_NS)
+    assert command([*words, "bag"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "bag: it looks as if the current is turned over" in line
