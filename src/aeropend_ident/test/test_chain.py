@@ -68,3 +68,18 @@ def test_slopes_are_those_of_all_residuals_by_all_parameters(chains):
         z[j] -= 1e-4 * (1.0 if z[j] + 1e-4 > search.high[j] else -1.0)
         slope = (search.stack(search.at(z)) - search.stack(search.current)) / (z[j] - search.z[j])
         np.testing.assert_allclose(every[j], slope, rtol=1e-6, atol=1e-9 * np.abs(slope).max())
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_bridge_without_slope_has_a_voltage_all_the_same(chains):
+    assert np.isfinite(chains.each[0].actuator({"k1": 0.0})).all()
+    assert np.isfinite(chains.each[0].actuator({"k2": 0.0})).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_channel_without_a_reading_to_fit_to_has_no_residual_and_any_delay():
+    signals = recorded(1, duration=8.0)
+    v_a = np.where(np.arange(len(signals)) < 20, signals.v_a, np.nan)
+    chain = CutChain.cut(BENCH, replace(signals, v_a=v_a))
+    assert chain.residuals("actuator")({}) == {}
+    assert chain.likeliest_delay({}) > 0.0

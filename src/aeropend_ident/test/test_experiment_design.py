@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from aeropend_ident.diagnosis.experiment_design import LONGEST, SEPARATE, advise, next_experiment
+from aeropend_ident.diagnosis.experiment_design import LONGEST, SEPARATE, advise, distances, next_experiment
 from aeropend_ident.diagnosis.free_run_gap import free_run
 from aeropend_ident.signals.signals import Signals
 from aeropend_ident.testing.rigs import BENCH, recorded
@@ -100,3 +100,11 @@ def test_a_rival_that_no_signal_rules_out_is_said_beside_the_experiment_for_the_
     assert advice.excite
     assert "from supply_sag by" in advice.why
     assert "measure k0 (" in advice.why
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_hypothesis_under_which_the_rig_diverges_is_told_apart_and_no_error(signals):
+    wild = ("diverges", hypothesis(c_over_J=-100.0))
+    ((distance, _),) = distances(BENCH, signals, wild, [("bench", hypothesis())], Excitation(duration=10.0))
+    assert np.isfinite(distance)
+    assert distance > SEPARATE

@@ -129,3 +129,18 @@ def test_a_slow_misfit_counts_for_less_than_white_noise_of_its_power_however_lon
         assert 0.0 < lost(slow) < 0.1 * lost(white)
         assert lost(slow) < 60.0
         assert lost(white) == pytest.approx(0.5 * n * np.log(10.0), rel=0.1)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("beyond", [1e300, np.inf, np.nan])
+def test_a_simulation_that_diverges_is_a_bad_fit_and_no_error(beyond):
+    plain = line(RNG.standard_normal(len(T)))
+
+    def residuals(values):
+        y = plain(values)["y"]
+        return {"y": np.where(T > 9.0, beyond, y) if values["slope"] > 2.5 or values["bend"] > 0.1 else y}
+
+    found = fit(residuals, [Parameter("slope", 2.4, 1.0), OFFSET, BEND])
+    assert found.values["slope"] == pytest.approx(2.0, abs=5.0 * found.sd["slope"])
+    far = Parameter("bend", 1.0, 1.0)
+    assert screen(residuals, fit(residuals, [SLOPE, OFFSET, BEND]), [SLOPE, OFFSET, BEND], [[far]])

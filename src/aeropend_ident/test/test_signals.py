@@ -287,3 +287,11 @@ def test_joined_turns_are_said(tmp_path):
     assert note.startswith("theta jumps by a turn ")
     assert np.nanmin(signals.theta) < -0.005
     assert np.nanmax(signals.theta) < 3.0
+
+
+def test_a_voltage_that_is_read_only_before_a_late_command_could_act_is_left_out():
+    read = columns()
+    v_a = np.where(np.arange(len(read["duty"])) < 200, read["v_a"], np.nan)
+    signals = from_arrays({**read, "v_a": v_a}, SAMPLE_PERIOD, BENCH.sensing)
+    assert not signals.has("v_a")
+    assert "v_a was not read in the part that is fitted: it is left out" in signals.notes

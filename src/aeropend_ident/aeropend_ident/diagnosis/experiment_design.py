@@ -20,7 +20,7 @@ from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD
 from aeropend_ident.diagnosis.chain.values import clipped
 from aeropend_ident.diagnosis.document import NextExperiment
 from aeropend_ident.diagnosis.free_run_gap import free_run
-from aeropend_ident.estimation.map_fit import DAMPING, DAMPING_DOWN
+from aeropend_ident.estimation.map_fit import DAMPING, DAMPING_DOWN, finite
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import CHANNELS, Signals
 from aeropend_sim.model.effects import DEFINED, PARAMETER_MISMATCH
@@ -208,7 +208,7 @@ class _Planned:
     def readings(self, values: Mapping[str, float]) -> Array:
         """(M,) All readings in units of their noise."""
         run = self.run(values)
-        return np.concatenate([run[c][at] / self.noise[c] for c, at in self.shown.items()])
+        return finite(np.concatenate([run[c][at] / self.noise[c] for c, at in self.shown.items()]))
 
     def slopes(self, values: Mapping[str, float], here: Array, scales: Mapping[str, float]) -> Array:
         """(P, M) Change of the readings (M,) by a standard deviation of each of P values."""

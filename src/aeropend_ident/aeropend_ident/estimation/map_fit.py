@@ -49,6 +49,9 @@ With many recordings some channel always changes a little."""
 WEIGHT_CHANGE = 0.02
 """Relative change of a channel's weight that counts as a change (choice)."""
 
+LARGEST = 1e9
+"""Largest residual (choice: one beyond it is of a simulation that diverges, and products of it are still numbers)."""
+
 STEP = 1e-4
 """Step of the finite differences, in standard deviations of the prior.
 
@@ -227,7 +230,7 @@ class Search:
     def at(self, z: Array) -> dict[str, Array]:
         """Residuals at a point z (P,) in standard units."""
         values = {p.name: p.value(x) for p, x in zip(self.parameters, z, strict=True)}
-        return {k: np.asarray(r) for k, r in self.residuals(values).items() if len(r)}
+        return {k: finite(np.asarray(r)) for k, r in self.residuals(values).items() if len(r)}
 
     def renew_weights(self) -> None:
         """Set noise inflation and effective sample size to those of the residuals at this point."""
@@ -390,6 +393,11 @@ def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence
     return Fit(values, sd, search.current, search.scale, search.ess, log_prior, products, search.prior)
 
 
+def finite(r: Array) -> Array:
+    """Residuals (N,) of which each is at most `LARGEST`, also where a simulation diverges."""
+    return r if np.abs(r).max() <= LARGEST else np.clip(np.nan_to_num(r, nan=LARGEST), -LARGEST, LARGEST)
+
+
 def sensitivities(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter]
                   ) -> dict[str, Sensitivities]:
     """Channel -> derivatives of the residuals with respect to the parameters in standard units, where these start."""
@@ -458,7 +466,7 @@ def screen(residuals: Callable[[dict[str, float]], Residuals], base: Fit, known:
     left = []
     for group in additions:
         values = {**base.values, **{p.name: p.begin for p in group}}
-        changed = {k: np.asarray(x) for k, x in residuals(values).items() if len(x)}
+        changed = {k: finite(np.asarray(x)) for k, x in residuals(values).items() if len(x)}
         column = search.stack({k: changed[k] for k in search.weight}) - r
         size = float(column @ column)
         if not np.isfinite(size) or size == 0.0:

@@ -151,7 +151,7 @@ class Signals:
     @property
     def after_unseen(self) -> int:
         """First sample whose voltage cannot come from a duty before the recording, whatever the command delay."""
-        return math.ceil(CATALOGUE["command_delay"].parameters["delay"].high / self.period) + 1
+        return after_unseen(self.period)
 
     @property
     def both_ways(self) -> bool:
@@ -186,6 +186,15 @@ class Signals:
         return bool(np.isfinite(self.channel(name)).any())
 
 
+def after_unseen(period: float) -> int:
+    """See `Signals.after_unseen`.
+
+    Args:
+        period: [s] between samples.
+    """
+    return math.ceil(CATALOGUE["command_delay"].parameters["delay"].high / period) + 1
+
+
 def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[str, float], held_out: float = 0.3,
                 name: str = "recording", notes: tuple[str, ...] = ()) -> Signals:
     """Clean the channels of a recording and estimate their noise.
@@ -216,9 +225,9 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
     train = max(1, round(n * (1.0 - held_out)))
     columns, said = {channel: np.where(np.isfinite(x), x, np.nan) for channel, x in columns.items()}, [*notes]
     said += _leave_out_stuck(columns, duty, train)
-    said += _leave_out_unread(columns, train)
+    said += _leave_out_unread(columns, period, train)
     said += _leave_out(columns, period, train)
-    said += _leave_out_unread(columns, train)
+    said += _leave_out_unread(columns, period, train)
     for part, where in ((slice(train), "fitted"), (slice(train, n), f"held out, the last {n - train} samples")):
         if n > train and np.isfinite(columns["theta"][part]).sum() < FEWEST:
             raise RecordingError(f"{name}: the arm angle was not read in the part that is {where}: it is missing, "
@@ -318,12 +327,13 @@ def _leave_out_stuck(columns: dict[str, Array], duty: Array, train: int) -> list
     return said
 
 
-def _leave_out_unread(columns: dict[str, Array], train: int) -> list[str]:
+def _leave_out_unread(columns: dict[str, Array], period: float, train: int) -> list[str]:
     """Leave out a channel of the motor that has no readings to fit to; returns a note for each."""
     said = []
     for channel in ("omega", "i_a", "v_a"):
         known = np.isfinite(columns[channel])
-        if known.any() and known[:train].sum() < FEWEST:
+        start = after_unseen(period) if channel == "v_a" else 0
+        if known.any() and known[start:train].sum() < FEWEST:
             columns[channel] = np.full(len(known), np.nan)
             said.append(f"{channel} was not read in the part that is fitted: it is left out")
     return said

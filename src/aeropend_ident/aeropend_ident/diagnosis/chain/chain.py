@@ -107,7 +107,9 @@ class CutChain:
             n = m.numbers()
             # the duty before the recording is taken from the first voltage: with a delay it acts for a while
             first = s.v_a[0] if np.isfinite(s.v_a[0]) else actuator.voltage_at(n, values.get("initial.omega", 0.0))
-            v = of(n, s.duty, m.effects, s.period, start=-piece.start, before=float(actuator.duty(n, first)))
+            with np.errstate(all="ignore"):  # a fit may try a bridge whose voltage does not depend on the duty
+                before = float(np.nan_to_num(actuator.duty(n, first)))
+            v = of(n, s.duty, m.effects, s.period, start=-piece.start, before=before)
             out[piece] = sensing.read_voltage(m, actuator.terminal_voltage(m, v[piece], self.current[piece], s.period))
         return out
 
@@ -120,8 +122,7 @@ class CutChain:
         """[s] The command delay that fits the voltage best; the middle of its sample period, in which all fit alike."""
         high = CATALOGUE["command_delay"].parameters["delay"].high
         tried = (np.arange(math.floor(high / self.signals.period)) + 0.5) * self.signals.period
-        errors = [sum(float(np.mean(r * r)) for r in
-                      self.actuator_residuals({**values, DELAY: d}).values()) for d in tried]
+        errors = [sum(float(r @ r) for r in self.actuator_residuals({**values, DELAY: d}).values()) for d in tried]
         return float(tried[int(np.argmin(errors))])
 
     def set_motor_input(self, values: Values) -> None:
@@ -242,8 +243,9 @@ class CutChain:
         return {"theta": self._train(s.theta, self.arm(values, s.train)) / s.sigma["theta"]}
 
     def residuals(self, stage: str) -> Callable[[Values], dict[str, Array]]:
-        """The residual function of a stage by name."""
-        return {"actuator": self.actuator_residuals, "motor": self.motor_residuals, "arm": self.arm_residuals}[stage]
+        """The residual function of a stage by name; a channel without a reading has none."""
+        of = {"actuator": self.actuator_residuals, "motor": self.motor_residuals, "arm": self.arm_residuals}[stage]
+        return lambda values: {channel: r for channel, r in of(values).items() if len(r)}
 
     def _train(self, measured: Array, simulated: Array, start: int = 0) -> Array:
         part = slice(start, self.signals.train)
