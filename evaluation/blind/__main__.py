@@ -5,6 +5,7 @@
     make blind ARGS="--count 60 --seed 7"
     make blind ARGS="--uncalibrated --count 120"    uncalibrated rigs
     make blind ARGS="--circumstances --count 100"   rigs as they are: many imperfections, feedback, lost samples
+    make blind ARGS="--without --count 60"          what the catalogue does not hold: flagged, placed, learned
     make blind ARGS=--docs                          the table of the last run goes into docs/results/blind.md
 
 Steps can be run alone: --steps make,diagnose,peers,score. The labels stay sealed until every verdict is written.
@@ -26,7 +27,20 @@ from aeropend_ident.signals.from_bag import from_recording
 from aeropend_ident.testing import bags
 from aeropend_sim.model.effects import RANDOM
 from aeropend_sim.model.parameters import load
-from evaluation.blind import cases, circumstances, folder, limit, page, pairs, peers, plant, report, score, uncalibrated
+from evaluation.blind import (
+    cases,
+    circumstances,
+    folder,
+    limit,
+    open_set,
+    page,
+    pairs,
+    peers,
+    plant,
+    report,
+    score,
+    uncalibrated,
+)
 
 SPARSE, BIC = "sparse regression of the discrepancy (pysindy)", "stepwise BIC on output error"
 SHARES = {"single": 0.54, "none": 0.18, "two": 0.14, "outside": 0.14}
@@ -135,6 +149,8 @@ def main() -> None:
                         help="only this circumstance, as messy")
     parser.add_argument("--pairs", action="store_true",
                         help="pairs of recordings of one rig between which something was changed, or nothing")
+    parser.add_argument("--without", action="store_true",
+                        help="open set: effects outside the catalogue, and each effect of it left out of the catalogue")
     parser.add_argument("--docs", action="store_true",
                         help="run nothing, write the table of the last run into docs/results")
     options = parser.parse_args()
@@ -142,13 +158,15 @@ def main() -> None:
     if options.docs:
         part, name = (("unknown", "uncalibrated") if options.uncalibrated else
                       ("circumstances", "circumstances") if options.circumstances else
-                      ("pairs", "pairs") if options.pairs else ("", "blind"))
+                      ("pairs", "pairs") if options.pairs else
+                      ("open_set", "open_set") if options.without else ("", "blind"))
         page.write(options.out / part, name)
         return
-    if options.pairs:
-        out = options.out / "pairs"
+    if options.pairs or options.without:
+        name, report_ = ("pairs", pairs.report) if options.pairs else ("open_set", open_set.report)
+        out = options.out / name
         out.mkdir(parents=True, exist_ok=True)
-        _save(out, pairs.report(options.count, options.seed, options.duration, options.jobs), options)
+        _save(out, report_(options.count, options.seed, options.duration, options.jobs), options)
         return
     if options.circumstances or options.uncalibrated:
         _other_rigs(options, steps)

@@ -111,7 +111,8 @@ Progress = Callable[[str, float], None]
 
 def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progress: Progress = lambda *_: None, *,
              fit_nominal: bool = False, material: float = MATERIAL_SHARE, seconds: float | None = None,
-             known: Known | None = None, further: Sequence[str] = ()) -> Diagnosis:
+             known: Known | None = None, further: Sequence[str] = (),
+             left_out: Sequence[str] = ()) -> Diagnosis:
     """Find where a model and a rig differ, which effect causes it, and how far the gap closes.
 
     Args:
@@ -124,6 +125,7 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
         seconds: [s] that the search may take; None: a budget of simulations bounds it where it may be long.
         known: what earlier verdicts of the rig know of the model; the verdict is then what has changed.
         further: ids of effects of effect files that are tried beside those of the catalogue.
+        left_out: ids of fitted effects that are not tried; not of those that only statistics show.
     """
     with threadpool_limits(1):  # the matrices are narrow: threads of the linear algebra would slow each other down
         policy = policy_of(recordings, fit_nominal=fit_nominal)
@@ -144,7 +146,7 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
         kind = CutChains if policy.calibrated else CachedChains
         chains = with_pwm_timing(kind(model, recordings, policy))
         chains.likely, chains.plain, chains.notes, chains.known = likely, plain, notes, known
-        chains.further = tuple(further)
+        chains.further, chains.left_out = tuple(further), tuple(left_out)
         return _diagnose(chains, Settings(jobs, material, seconds), progress)
 
 
@@ -279,7 +281,7 @@ def _fitted_further(fitted: CutChains) -> CutChains:
     note = (f"after {s.train * s.period:.1f} s the rig behaves otherwise than before: the fit goes on up to "
             f"{further * s.period:.1f} s, only the rest is held out")
     longer = type(fitted)(fitted.model, [replace(s, train=further).noted(note)], fitted.policy)
-    longer.known, longer.further = fitted.known, fitted.further
+    longer.known, longer.further, longer.left_out = fitted.known, fitted.further, fitted.left_out
     return longer
 
 

@@ -270,6 +270,7 @@ class CutChains:
         self.plain: Model | None = None  # the best nominal model without further terms, of a driven rig
         self.known: Known | None = None  # what earlier verdicts know of the rig
         self.further: tuple[str, ...] = ()  # ids of effects of effect files that are tried too
+        self.left_out: tuple[str, ...] = ()  # ids of effects that are not tried
         self.notes: tuple[str, ...] = ()  # what the recordings do not tell of the nominal model of a driven rig
         self.each = [self._cut(signals) for signals in recordings]
 

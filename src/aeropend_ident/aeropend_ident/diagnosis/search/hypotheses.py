@@ -103,18 +103,19 @@ class Hypothesis:
         return math.log(EFFECT_ODDS / (FEWEST_PARAMETERS if self.parameter else 1))
 
 
-def hypotheses(model: Model, further: Sequence[str] = (), *, mismatches: bool = True, known: Known | None = None
-               ) -> list[Hypothesis]:
+def hypotheses(model: Model, further: Sequence[str] = (), left_out: Sequence[str] = (), *, mismatches: bool = True,
+               known: Known | None = None) -> list[Hypothesis]:
     """Every effect that the model lacks: of the catalogue, and of effect files.
 
     Args:
         model: the nominal model.
         further: ids of effects of effect files.
+        left_out: ids of effects that are not tried.
         mismatches: whether each parameter of the model may be far off, too.
         known: what earlier verdicts know; parameters and effects that they have determined may have changed.
     """
     all_ = [Hypothesis(id_, starts=tuple(_starts(id_, model))) for id_ in (*CATALOGUE, *further)
-            if id_ not in model.effects]
+            if id_ not in model.effects and id_ not in left_out]
     if known is not None:
         return [*all_, *_changes(model, known)]
     if not mismatches:

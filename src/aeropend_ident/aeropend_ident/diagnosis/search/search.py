@@ -93,7 +93,7 @@ def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], No
     """
     findings: dict[str, Findings] = {}
     calibrated, known = chains.policy.calibrated, chains.known
-    all_ = hypotheses(chains.model, chains.further, mismatches=calibrated, known=known)
+    all_ = hypotheses(chains.model, chains.further, chains.left_out, mismatches=calibrated, known=known)
     everything = [as_identified(chains, h) for h in all_ if not is_decided(chains, h)]
     acts_on = {h.name: stages_of(chains, h) for h in everything}
     carried: dict[str, Parameter] = {}
