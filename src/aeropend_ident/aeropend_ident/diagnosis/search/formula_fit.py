@@ -64,7 +64,8 @@ def fitted_formulas(chains: CutChains, learned: Learned, values: Mapping[str, fl
         pool: threads.
     """
     proposals = _proposals(chains, learned, values, sd)[:TRIED]
-    found = list(pool.map(lambda p: _fitted(chains, learned, p, values), proposals))
+    fitted = pool.map(lambda p: _fitted(chains, learned, p, values), proposals)
+    found = [f for f in fitted if f is not None]
     least = min((f.fit.mean_square for f in found), default=0.0)
 
     def rank(f: FittedFormula) -> tuple[int, float]:
@@ -133,8 +134,8 @@ def _with_memory(tree: dict[str, object], learned: Learned, values: Mapping[str,
 
 
 def _fitted(chains: CutChains, learned: Learned, tree: dict[str, object], values: Mapping[str, float]
-            ) -> FittedFormula:
-    """Fit a formula in place of the learned term."""
+            ) -> FittedFormula | None:
+    """Fit a formula in place of the learned term; None if nothing of it is left."""
     id_ = _defined(tree, learned.place)
     findings = learned.without
     known = [*nominal_parameters(chains, findings.stage), *(p for h in findings.effects for p in h.own)]
@@ -143,7 +144,10 @@ def _fitted(chains: CutChains, learned: Learned, tree: dict[str, object], values
     found = fit(residuals, [*started(known, values), *own], least_ess=chains.policy.least_ess)
     parameters = {n: {**old, "default": found.values[f"{id_}.{n}"]}
                   for n, old in tree["parameters"].items()}  # type: ignore[attr-defined]
+    size = DEFINED[id_].size
     effect_file.forget(id_)
+    if found.values[f"{id_}.{size}"] == 0.0:
+        return None
     final = _defined({**tree, "parameters": parameters}, learned.place)
     values = {n.replace(f"{id_}.", f"{final}."): v for n, v in found.values.items()}
     return FittedFormula(final, values, found)
