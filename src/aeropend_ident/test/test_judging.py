@@ -10,7 +10,7 @@ import pytest
 
 from aeropend_ident.bags.recording import CHANNELS, RecordingError, read
 
-JOINT, BATTERY = "sensor_msgs/msg/JointState", "sensor_msgs/msg/BatteryState"
+JOINT, BATTERY, FLOAT = "sensor_msgs/msg/JointState", "sensor_msgs/msg/BatteryState", "std_msgs/msg/Float64"
 N, PERIOD = 400, 20_000_000
 STAMPS = 1_700_000_000_000_000_000 + PERIOD * np.arange(N)
 DAY = 86_400 * 10**9
@@ -73,6 +73,17 @@ def test_duties_that_are_no_fractions_are_refused_with_the_command_that_mends_th
     with pytest.raises(RecordingError, match=f"duty goes from 0 to {full:g}, .*`import BAG NEW --duty duty:{option}` "):
         read(bag)
     assert read(bag, judged=False).duty[-1] == full
+
+
+def test_commands_in_percent_are_said_where_they_are_the_duty(bags, tmp_path):
+    sent = (("/duty_command", FLOAT, int(STAMPS[row]), bags.number(value)) for row, value in ((0, 0.0), (99, 40.0)))
+    joints = [("/joint_states", JOINT, int(t), bags.joint(int(t), [0.1, 0.0], [0.0, 1.0])) for t in STAMPS]
+    bag = bags.write(tmp_path / "bag", bags.Content([*sent, *joints]))
+    recording = read(bag)
+    assert set(recording.duty) == {0.0, 1.0}
+    (note,) = (note for note in recording.notes if note.startswith("1 of 2 duty_commands is beyond"))
+    assert "`import BAG NEW --duty duty:%` mends it" in note
+    assert set(read(bag, judged=False).duty) == {0.0, 40.0}
 
 
 def test_a_reading_too_small_for_any_sensor_is_0(bags, tmp_path):

@@ -73,6 +73,21 @@ def channel(name: str, values: Floats, notes: list[str]) -> Floats:
     return np.where(wrong, np.nan, values)
 
 
+def clamped(commands: Floats, notes: list[str]) -> Floats:
+    """Duties commanded (K,), as a rig clamps them.
+
+    Args:
+        commands: (K,) as sent; numbers.
+        notes: gets a note of the number that was beyond -1..1.
+    """
+    beyond = int((np.abs(commands) > 1.0 + ROUNDING).sum())
+    if beyond:
+        notes.append(f"{beyond} of {counted(len(commands), 'duty_command')} {'is' if beyond == 1 else 'are'} beyond -1 "
+                     "to 1: taken as -1 or 1, as a rig does; if they are in percent, `import BAG NEW --duty duty:%` "
+                     "mends it")
+    return np.clip(commands, -1.0, 1.0)
+
+
 def times(seconds: NDArray[np.int64], rest: NDArray[np.int64]) -> tuple[Stamps, Mask]:
     """Stamps [ns] (N,) of messages, and which of them are times: not before 1970, with less than 1e9 ns.
 

@@ -276,7 +276,7 @@ class _Join:
         self.command = self._values(topics.get("duty_command"))
         self.reference = self._values(topics.get("reference"))
         if not len(armature.stamps):
-            self._take_duty_from_command()
+            self._take_duty_from_command(judged=judged)
         repeated = self.duplicates
         self.truth = self._truth(topics)
         self.duplicates = repeated
@@ -398,13 +398,15 @@ class _Join:
                 columns[name][rows] = table.columns[name][known]
         return columns
 
-    def _take_duty_from_command(self) -> None:
-        """Hold the last command the rig would have taken: finite, clamped to -1..1."""
+    def _take_duty_from_command(self, *, judged: bool) -> None:
+        """Hold the last command the rig would have taken: finite, clamped to -1..1 if `judged`."""
         times, values = self.command
         taken = np.isfinite(values)
         if not taken.any():
             return
-        times, values = times[taken], np.clip(values[taken], -1.0, 1.0)
+        times, values = times[taken], values[taken]
+        if judged:
+            values = judging.clamped(values, self.notes)
         last = np.searchsorted(times, self.received, side="right") - 1
         self.columns["duty"] = np.where(last >= 0, values[last], np.nan)
         self.notes.append("no armature: the duty is that of duty_command by the time it was received")
