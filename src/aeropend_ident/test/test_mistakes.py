@@ -12,6 +12,7 @@ from aeropend_ident.commands import bench, excitation_quality, identify
 from aeropend_ident.commands.import_table import main as import_
 from aeropend_ident.signals import mistakes
 from aeropend_ident.signals.from_bag import as_signals
+from aeropend_ident.signals.signals import Mounting
 from aeropend_ident.testing.bags import write
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import rig
@@ -101,6 +102,14 @@ def test_a_size_that_no_rig_has_is_refused(columns, channel):
     (one,) = mistakes.found(odd, columns["duty"], SAMPLE_PERIOD, BENCH)
     assert one.sure
     assert "check its unit, or give the model file" in one.text
+
+
+def test_an_angle_whose_mounting_is_known_is_no_mistake(columns, tmp_path):
+    mounting = Mounting(0.5, flipped=True)
+    write(tmp_path / "bag", columns | {"theta": 0.5 - columns["theta"]}, PERIOD_NS)
+    assert as_signals(read(tmp_path / "bag"), BENCH, mounting=mounting).notes == ()
+    with pytest.raises(RecordingError, match="turned over"):
+        as_signals(read(tmp_path / "bag"), BENCH)
 
 
 def test_an_angle_whose_zero_is_set_while_it_is_recorded_is_refused(columns):

@@ -164,8 +164,9 @@ def run(options: argparse.Namespace, command: str) -> None:
                             f"{Path(options.model).parent} knows how surely; with --model every parameter counts as "
                             "known to 5 %"), file=sys.stderr)
     with progress("reading") as show:
-        signals, tests = ([signals_of(bag, options.namespace, model, options.held_out,
-                                      fit_nominal=uncalibrated) for bag in bags]
+        mounting = of_rig.mounting if of_rig else None
+        signals, tests = ([signals_of(bag, options.namespace, model, options.held_out, fit_nominal=uncalibrated,
+                                      mounting=mounting) for bag in bags]
                           for bags in (options.bags, options.test))
         if of_rig is not None:
             signals = [(of_rig.mounting or Mounting()).of(s) for s in signals]

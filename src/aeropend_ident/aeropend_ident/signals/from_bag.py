@@ -24,7 +24,7 @@ from aeropend_ident.signals.grid import check_period, irregular_grid, longest_pi
 from aeropend_ident.signals.noise import reading_noise_at, white_noise_at
 from aeropend_ident.signals.outliers import joined_turns, jumps_out
 from aeropend_ident.signals.pulses import hold
-from aeropend_ident.signals.signals import CHANNELS, MINIMUM_DURATION, STILL, Signals, from_arrays
+from aeropend_ident.signals.signals import CHANNELS, MINIMUM_DURATION, STILL, Mounting, Signals, from_arrays
 from aeropend_sim.model.parameters import Model
 from aeropend_sim.wording import counted
 
@@ -66,7 +66,7 @@ kept; and share of the held-out part that rests from which on it is left out (ch
 
 
 def signals_of(bag: str | Path, namespace: str | None, model: Model, held_out: float = 0.3, *,
-               fit_nominal: bool = False) -> Signals:
+               fit_nominal: bool = False, mounting: Mounting | None = None) -> Signals:
     """Read a bag as signals.
 
     Args:
@@ -75,15 +75,16 @@ def signals_of(bag: str | Path, namespace: str | None, model: Model, held_out: f
         model: gives the parameters of the measurement chain, and the duty of a voltage.
         held_out: share of the recording at its end that models are not fitted to.
         fit_nominal: whether the rig is uncalibrated.
+        mounting: of the angle's sensor, if it is known; the caller applies it.
 
     Raises:
         RecordingError: no verdict is possible; one line that says why.
     """
-    return as_signals(recording.read(bag, namespace), model, held_out, fit_nominal=fit_nominal)
+    return as_signals(recording.read(bag, namespace), model, held_out, fit_nominal=fit_nominal, mounting=mounting)
 
 
-def as_signals(read: Recording, model: Model, held_out: float = 0.3, *, fit_nominal: bool = False
-               ) -> Signals:
+def as_signals(read: Recording, model: Model, held_out: float = 0.3, *, fit_nominal: bool = False,
+               mounting: Mounting | None = None) -> Signals:
     """A recording as signals; arguments and errors as for `signals_of`.
 
     Args:
@@ -91,6 +92,7 @@ def as_signals(read: Recording, model: Model, held_out: float = 0.3, *, fit_nomi
         model: gives the parameters of the measurement chain, and the duty of a voltage.
         held_out: share of the recording at its end that models are not fitted to.
         fit_nominal: whether the rig is uncalibrated.
+        mounting: of the angle's sensor, if it is known; the caller applies it.
     """
     theta, jumps = joined_turns(read.theta)
     if jumps:
@@ -101,7 +103,7 @@ def as_signals(read: Recording, model: Model, held_out: float = 0.3, *, fit_nomi
     if not fit_nominal:
         check_period(read)
         piece = longest_piece(with_voltage_as_command(read, model.model["v_full"]) if model.model["v_full"] else read)
-        return from_recording(checked(piece, model), model.sensing, held_out)
+        return from_recording(checked(piece, model, mounting), model.sensing, held_out)
     if len(read) < FEWEST:
         raise RecordingError(f"{read.path}: {len(read)} samples are too few for a verdict")
     piece = longest_piece(with_voltage_as_command(read))
@@ -110,12 +112,13 @@ def as_signals(read: Recording, model: Model, held_out: float = 0.3, *, fit_nomi
     return from_uncalibrated(piece, model.sensing, held_out)
 
 
-def checked(read: Recording, model: Model) -> Recording:
+def checked(read: Recording, model: Model, mounting: Mounting | None = None) -> Recording:
     """A recording of a calibrated rig, with a note on each likely mistake of its units, signs, zero and columns.
 
     Args:
         read: the recording.
         model: the nominal model.
+        mounting: of the angle's sensor, if it is known.
 
     Raises:
         RecordingError: a mistake is sure: no result could be right.
@@ -127,6 +130,7 @@ def checked(read: Recording, model: Model) -> Recording:
     columns = _columns(piece, index)
     if not np.isfinite(columns["duty"]).any():
         return read
+    columns["theta"] = (mounting or Mounting()).upright(columns["theta"])
     likely = mistakes.found(columns, hold(columns["duty"]), period, model)
     if sure := [one for one in likely if one.sure]:
         raise RecordingError(f"{read.path}: {sure[0].text}")

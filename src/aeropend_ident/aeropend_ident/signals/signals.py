@@ -66,11 +66,14 @@ class Mounting:
 
     def of(self, s: Signals) -> Signals:
         """A recording whose angle is 0 where the arm hangs, and positive where it is lifted."""
-        theta = s.theta - self.zero
-        return replace(s, theta=-theta if self.flipped else theta, mounting=self)
+        return replace(s, theta=self.upright(s.theta), mounting=self)
+
+    def upright(self, theta: Array) -> Array:
+        """[rad] (N,) The angles of readings (N,), the inverse of `reading`."""
+        return self.zero - theta if self.flipped else theta - self.zero
 
     def reading(self, theta: float) -> float:
-        """[rad] The reading at an angle, the inverse of `of`."""
+        """[rad] The reading at an angle."""
         return self.zero - theta if self.flipped else self.zero + theta
 
     def notes(self) -> tuple[str, ...]:
