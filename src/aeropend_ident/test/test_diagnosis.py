@@ -3,6 +3,7 @@
 
 import json
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -329,3 +330,10 @@ def test_what_is_held_out_moves_no_fit():
     assert whole["which"]["effects"] == ["coulomb_friction"]
     assert other["which"] == whole["which"]
     assert other["shrink"]["gap_after"] > 2.0 * whole["shrink"]["gap_after"]
+
+
+def test_a_channel_that_is_read_only_in_the_part_that_is_held_out_is_no_error():
+    signals = recorded(3, duration=8.0)
+    late = np.where(np.arange(len(signals)) < signals.train, np.nan, signals.i_a)
+    found = diagnose(BENCH, [replace(signals, i_a=late)], 1, seconds=0.1)
+    assert "i_a" not in found.body["channels"]

@@ -289,9 +289,30 @@ def test_joined_turns_are_said(tmp_path):
     assert np.nanmax(signals.theta) < 3.0
 
 
+def test_a_speed_without_a_pulse_in_the_part_that_is_fitted_is_left_out():
+    read = columns()
+    late = np.arange(len(read["duty"])) > 0.8 * len(read["duty"])
+    false = 50.0 + 1e3 * (np.arange(len(late)) % 9 == 0)
+    signals = from_arrays({**read, "omega": np.where(late, read["omega"] + 50.0, false)}, SAMPLE_PERIOD, BENCH.sensing)
+    assert not signals.has("omega")
+    assert signals.pulses is None
+    assert "omega was not read in the part that is fitted: it is left out" in signals.notes
+
+
 def test_a_voltage_that_is_read_only_before_a_late_command_could_act_is_left_out():
     read = columns()
     v_a = np.where(np.arange(len(read["duty"])) < 200, read["v_a"], np.nan)
     signals = from_arrays({**read, "v_a": v_a}, SAMPLE_PERIOD, BENCH.sensing)
     assert not signals.has("v_a")
     assert "v_a was not read in the part that is fitted: it is left out" in signals.notes
+
+
+def test_a_speed_that_is_false_in_the_part_that_is_held_out_is_left_out_there():
+    read = columns()
+    k = np.arange(len(read["duty"]))
+    false = np.where(k >= 0.7 * len(k), np.where(k % 2 == 0, 900.0, 30.0), read["omega"])
+    signals = from_arrays({**read, "omega": false}, SAMPLE_PERIOD, BENCH.sensing)
+    assert np.isfinite(signals.omega[:signals.train]).sum() > 1000
+    assert not np.isfinite(signals.omega[signals.train:]).any()
+    assert signals.pulses.index.max() < signals.train
+    assert "omega is false in the part that is held out: it is left out there" in signals.notes

@@ -448,7 +448,7 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
     places = gap_share.share_of_places(parts, lambda: _parts_of_parameters(joint, gaps))
     return Conclusions(
         channels={c: Channel(CHANNELS[c], gaps.before.rms[c], gaps.floors[c], gaps.after.rms[c], *gaps.fits(c))
-                  for c in CHANNELS if c in gaps.before.rms},
+                  for c in CHANNELS if all(c in g.rms for g in (gaps.before, gaps.after, gaps.fitted))},
         where=Where(head.place, regions.shares(places), tuple(regions.regions(found.misfit))),
         which=Which(head.verdict, tuple(head.effects), candidates, rows,
                     {channel: Residual(check.rms[channel], check.white[channel], check.dependence)

@@ -37,6 +37,8 @@ AS_MUCH = 0.3
 LEAST_LEFT = 0.1
 """Least share of the current's readings that must be left beside steps at unknown instants (choice: some seconds)."""
 
+UNREAD = "{} was not read in the part that is fitted: it is left out"
+
 FEWEST = 10
 """Readings below which a channel was not read (choice: fewer give neither a fit nor a gap)."""
 
@@ -262,6 +264,16 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
         pulses = replace(pulses, sigma=np.where(shaken[pulses.index], UNSURE * pulses.omega, pulses.sigma))
     false_speed = pulses.false_samples(n) if pulses else split_apply(
         lambda x: far_from_median(x, sigma["omega"]), columns["omega"], train)
+    known = np.isfinite(columns["omega"])
+    true = known & ~false_speed
+    if known.any() and true[:train].sum() < FEWEST:
+        columns["omega"], pulses, false_speed = np.full(n, np.nan), None, np.zeros(n, dtype=bool)
+        said.append(UNREAD.format("omega"))
+    elif known[train:].any() and true[train:].sum() < FEWEST:
+        columns["omega"] = np.where(np.arange(n) < train, columns["omega"], np.nan)
+        false_speed[train:] = False
+        pulses = None if pulses is None else pulses.of(pulses.index < train)
+        said.append("omega is false in the part that is held out: it is left out there")
     return Signals(period, duty, columns["theta"], columns["omega"], columns["i_a"], columns["v_a"], sigma, pulses,
                    false_speed, train, tuple(said))
 
@@ -338,7 +350,7 @@ def _leave_out_unread(columns: dict[str, Array], period: float, train: int) -> l
         start = after_unseen(period) if channel == "v_a" else 0
         if known.any() and known[start:train].sum() < FEWEST:
             columns[channel] = np.full(len(known), np.nan)
-            said.append(f"{channel} was not read in the part that is fitted: it is left out")
+            said.append(UNREAD.format(channel))
     return said
 
 
