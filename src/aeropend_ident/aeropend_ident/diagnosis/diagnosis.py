@@ -60,6 +60,7 @@ from aeropend_ident.diagnosis.search.unknown_effect import UnknownEffect
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import CHANNELS, Signals
 from aeropend_ident.signals.statistics import rms
+from aeropend_sim.model import effect_file
 from aeropend_sim.model.effects import DEFINED
 from aeropend_sim.model.parameters import Model
 from aeropend_sim.wording import times
@@ -332,6 +333,7 @@ def _with_learned_term(fitted: CutChains, found: _Findings, joint: JointFit, gap
     with_ = replace(found, stages=stages, unknown=placed, learned=learned)
     with_, joint_with, gaps_with = _fit_and_measure(fitted, with_, progress)
     if gaps_with.after.total >= gaps.after.total:
+        effect_file.forget(learned.id)
         return found, joint, gaps, parts
     return with_, joint_with, gaps_with, _parts(with_, joint_with, gaps_with, settings.jobs)
 
