@@ -38,6 +38,8 @@ def verdict(request):
     return request.param, diagnose(BENCH, [signals], 2)
 
 
+@pytest.mark.promise("Verdict", "Where the verdict is `unknown`, the missing term is learned at its place, and its "
+                     "share of the gap on unseen data is told")
 def test_an_effect_outside_of_the_catalogue_is_learned_at_its_place(verdict):
     id_, found = verdict
     which, closure = found.conclusions.which, found.conclusions.closure
@@ -50,6 +52,7 @@ def test_an_effect_outside_of_the_catalogue_is_learned_at_its_place(verdict):
     assert which.unknown.id not in {c.effect for c in which.candidates}
 
 
+@pytest.mark.promise("Augmented model", "The plant runs a learned term from `augmented.yaml` alone")
 def test_the_plant_runs_what_was_learned(verdict, tmp_path):
     """On other duties the augmented model, read from its file, is nearer to the rig than the nominal one."""
     id_, found = verdict
@@ -65,6 +68,7 @@ def test_the_plant_runs_what_was_learned(verdict, tmp_path):
     assert np.std(truth - again) < 0.5 * np.std(truth - nominal)
 
 
+@pytest.mark.promise("Verdict", "Formulas are proposed for a learned term, in a file that `diagnose --effects` takes")
 def test_a_formula_is_proposed_and_is_tomorrows_catalogue_entry(verdict, tmp_path):
     id_, found = verdict
     closure, formulas = found.conclusions.closure, found.conclusions.which.unknown.formulas

@@ -38,6 +38,7 @@ def written(tmp_path, text):
     return path
 
 
+@pytest.mark.promise("Augmented model", "An effect can be given by a formula in a file, without touching the source")
 def test_an_effect_file_defines_effects(tmp_path):
     found = effect_file.load(written(tmp_path, SPRING + HOSE))
     assert list(found) == ["file_spring", "file_hose"]
