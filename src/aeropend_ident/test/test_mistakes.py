@@ -121,6 +121,13 @@ def test_an_angle_whose_zero_is_set_while_it_is_recorded_is_refused(columns):
     assert mistakes.found(columns | {"theta": single}, columns["duty"], SAMPLE_PERIOD, BENCH) == []
 
 
+def test_the_voltage_of_a_supply_is_no_current(columns):
+    noise = 0.02 * np.random.default_rng(0).standard_normal(len(columns["duty"]))
+    for sag in (0.0, 0.3):
+        supply = 12.0 - sag * columns["i_a"] + noise
+        assert mistakes.without_model(columns["theta"], columns["duty"], columns["v_a"], supply) == []
+
+
 def test_of_an_uncalibrated_rig_degrees_and_exchanged_columns_are_a_note(columns, tmp_path):
     changed = {"theta": np.degrees(columns["theta"]), "i_a": columns["v_a"], "v_a": columns["i_a"]}
     write(tmp_path / "bag", columns | changed, PERIOD_NS)
