@@ -75,6 +75,26 @@ def test_duties_that_are_no_fractions_are_refused_with_the_command_that_mends_th
     assert read(bag, judged=False).duty[-1] == full
 
 
+def test_a_duty_that_is_infinite_for_a_while_is_left_out(bags, tmp_path):
+    recording = read(written(bags, tmp_path, columns={"duty": np.where(np.arange(N) < 300, 0.5, math.inf)}))
+    assert np.isfinite(recording.duty).sum() == 300
+    assert recording.notes[0].startswith("100 readings of duty are no possible number")
+
+
+def test_one_message_of_other_joints_takes_no_channel_away(bags, tmp_path):
+    armature = [("/armature", BATTERY, int(t), bags.battery(int(t), 1.0, 0.5, 0.3)) for t in STAMPS]
+
+    def named(folder, *names):
+        """A recording whose first joints have one set of names, all others another."""
+        joints = [("/joint_states", JOINT, int(t), bags.joint(int(t), [0.1, 0.0], [0.0, 1.0], names[min(k, 1)]))
+                  for k, t in enumerate(STAMPS)]
+        return read(bags.write(tmp_path / folder, bags.Content([*joints, *armature])))
+
+    assert np.isfinite(named("one", ["臂", "转子"], ["arm", "rotor"]).theta).sum() == N - 1
+    recording = named("all", ["pole", "fan"], ["pole", "fan"])
+    assert recording.notes[0] == "/joint_states has no joint named arm or rotor (its joints: fan, pole): left out"
+
+
 def test_commands_in_percent_are_said_where_they_are_the_duty(bags, tmp_path):
     sent = (("/duty_command", FLOAT, int(STAMPS[row]), bags.number(value)) for row, value in ((0, 0.0), (99, 40.0)))
     joints = [("/joint_states", JOINT, int(t), bags.joint(int(t), [0.1, 0.0], [0.0, 1.0])) for t in STAMPS]

@@ -60,8 +60,9 @@ def channel(name: str, values: Floats, notes: list[str]) -> Floats:
     number = int(wrong.sum())
     if not number:
         return values
-    if name == "duty" and number > MANY * np.isfinite(values).sum():
-        low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    known = values[np.isfinite(values)]
+    if name == "duty" and int((np.abs(known) > 1.0).sum()) > MANY * len(known):
+        low, high = float(known.min()), float(known.max())
         unit, option = ("percent", "%") if max(-low, high) <= PERCENT else ("counts of 255", "counts:255")
         raise RecordingError(
             f"the duty goes from {low:.3g} to {high:.3g}, but is a fraction, -1 to 1: if it is in {unit}, `import BAG "

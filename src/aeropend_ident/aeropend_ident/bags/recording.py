@@ -19,6 +19,7 @@ from aeropend_ident.bags import judging
 from aeropend_ident.bags.cdr import Block, decode
 from aeropend_ident.bags.container import Bag
 from aeropend_ident.bags.reading import RecordingError
+from aeropend_sim.untrusted import printable
 from aeropend_sim.wording import counted
 
 __all__ = ["CHANNELS", "Recording", "RecordingError", "Truth", "holds", "read", "split_topic"]
@@ -30,6 +31,9 @@ CHANNELS = ("theta", "omega", "i_a", "v_a", "duty")
 
 OFF_GRID = 0.25
 """Part of a period by which a step between stamps may miss the grid."""
+
+MOST_NAMES = 8
+"""Joints of another robot that are named (choice)."""
 
 IRREGULAR = 0.01
 """Share of steps off the grid from which on it is said."""
@@ -155,9 +159,9 @@ def read(path: Path | str, namespace: str | None = None, *, judged: bool = True)
             one = series[key] = _Series(connection.topic, connection.msgtype)
         one.times.append(time)
         one.messages.append(data)
-    rigs = _rigs(series, bag)
+    rigs, strange = _rigs(series, bag)
     found = _choose(rigs, namespace, bag)
-    notes: list[str] = []
+    notes = [strange[found]] if found in strange else []
     try:
         recording = _Join(rigs[found], notes, judged=judged).recording(str(path), found, complete=not bag.problems)
     except RecordingError as error:
@@ -193,25 +197,30 @@ class _Series:
         self.messages: list[bytes] = []
 
 
-def _rigs(series: dict[tuple[str, str], _Series], bag: Bag) -> dict[str, dict[str, _Series]]:
-    """Sort the series into rigs: namespace -> topic -> series. A rig has an armature, or a joint named arm or rotor."""
+def _rigs(series: dict[tuple[str, str], _Series], bag: Bag) -> tuple[dict[str, dict[str, _Series]], dict[str, str]]:
+    """Sort the series into rigs: namespace -> topic -> series. A rig has an armature, or a joint named arm or rotor.
+
+    Returns:
+        The rigs, and by namespace what is to be said of joints that are none of ours.
+    """
     rigs: dict[str, dict[str, _Series]] = {}
     for one in series.values():
         split = split_topic(one.topic, one.msgtype)
         assert split is not None
         rigs.setdefault(split[0], {})[split[1]] = one
-    strangers = []
+    strange: dict[str, str] = {}
     for place, topics in list(rigs.items()):
         joints = topics.get("joint_states")
-        if joints is not None and not _has_our_joints(joints):
-            strangers.append(joints.topic)
+        if joints is not None and (names := _other_joints(joints)) is not None:
+            its = f" (its joints: {', '.join(names)})" if names else ""
+            strange[place] = f"{joints.topic} has no joint named {_ARM} or {_ROTOR}{its}"
             del topics["joint_states"]
         if not {"joint_states", "armature"} & set(topics):
             del rigs[place]
     if rigs:
-        return rigs
-    if strangers:
-        raise RecordingError(f"{bag.path}: {', '.join(strangers)} has no joint named {_ARM} or {_ROTOR}")
+        return rigs, {place: f"{said}: left out" for place, said in strange.items()}
+    if strange:
+        raise RecordingError(f"{bag.path}: {'; '.join(strange.values())}")
     if not bag.counts.total():
         why = f" ({bag.problems[0]})" if bag.problems else ""
         raise RecordingError(f"{bag.path}: holds no messages{why}")
@@ -220,9 +229,13 @@ def _rigs(series: dict[tuple[str, str], _Series], bag: Bag) -> dict[str, dict[st
     raise RecordingError(f"{bag.path}: no message of joint_states or armature in it; it holds {listed}")
 
 
-def _has_our_joints(joints: _Series) -> bool:
-    blocks, _ = decode(joints.messages[:1], _JOINT)
-    return not blocks or bool({_ARM, _ROTOR} & set(blocks[0].names.get("name", ())))
+def _other_joints(joints: _Series) -> list[str] | None:
+    """The names of joints of which none is ours; None if one is, or if no message can be decoded."""
+    for messages in (joints.messages[:1], joints.messages):  # the first message tells, but for a strange one
+        names = {name for block in decode(messages, _JOINT)[0] for name in block.names.get("name", ())}
+        if {_ARM, _ROTOR} & names:
+            return None
+    return sorted(map(printable, names))[:MOST_NAMES] if decode(joints.messages[:1], _JOINT)[0] else None
 
 
 def _choose(rigs: dict[str, dict[str, _Series]], namespace: str | None, bag: Bag) -> str:
