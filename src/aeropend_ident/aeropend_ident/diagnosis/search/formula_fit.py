@@ -142,11 +142,12 @@ def _fitted(chains: CutChains, learned: Learned, tree: dict[str, object], values
     own = [_parameter(f"{id_}.{n}", p.default, p.low, p.high) for n, p in DEFINED[id_].parameters.items()]
     residuals = chains.residuals(findings.stage)
     found = fit(residuals, [*started(known, values), *own], least_ess=chains.policy.least_ess)
-    parameters = {n: {**old, "default": found.values[f"{id_}.{n}"]}
+    effect = DEFINED[id_]
+    estimates = {n: min(max(found.values[f"{id_}.{n}"], p.low), p.high) for n, p in effect.parameters.items()}
+    parameters = {n: {**old, "default": estimates[n]}
                   for n, old in tree["parameters"].items()}  # type: ignore[attr-defined]
-    size = DEFINED[id_].size
     effect_file.forget(id_)
-    if found.values[f"{id_}.{size}"] == 0.0:
+    if estimates[effect.size] == effect.parameters[effect.size].neutral:
         return None
     final = _defined({**tree, "parameters": parameters}, learned.place)
     values = {n.replace(f"{id_}.", f"{final}."): v for n, v in found.values.items()}
