@@ -31,3 +31,10 @@ def test_share_of_what_can_close():
     assert 0.97 < low <= share <= high <= 1.0
     assert closure(before, before, floors)[0] == pytest.approx(0.0)
     assert closure(after, after, floors) == (None, None, None)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_run_that_gives_no_number_has_no_gap_and_no_warning():
+    signals = recorded(21, duration=8.0)
+    nothing = {c: np.full(len(signals), np.nan) for c in ("theta", "omega", "i_a", "v_a")}
+    assert np.isnan(gap(nothing, signals, signals.train, len(signals)).total)

@@ -149,7 +149,7 @@ def gap(readings: Mapping[str, Array], signals: Signals, start: int, stop: int,
         if known.sum() < FEWEST:
             continue
         error = np.where(known, readings[channel][start:stop] - measured, np.nan)
-        rms[channel] = float(np.sqrt(np.nanmean(error**2)))
+        rms[channel] = float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else math.nan  # it diverges
         everywhere = float(np.nanstd(signals.channel(channel)))
         here = float(np.std(measured[known]))
         spread[channel] = max(here if here > AT_REST * everywhere else everywhere, signals.sigma[channel], 1e-12)
