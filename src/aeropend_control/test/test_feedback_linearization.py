@@ -8,7 +8,8 @@ from aeropend_control.analysis import closed_loop
 from aeropend_control.analysis.step_response import step_responses
 from aeropend_control.laws.feedback_linearization import THESIS_GAINS, FeedbackLinearization, tune
 from aeropend_control.laws.tuning import TuningError
-from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model import effect_file
+from aeropend_sim.model.effects import CATALOGUE, DEFINED
 from aeropend_sim.model.parameters import Model, load
 from aeropend_sim.model.rig import Rig, Sample
 
@@ -56,6 +57,35 @@ def test_an_effect_that_the_model_names_is_compensated(effect):
         assert step.settling_time == pytest.approx(1.45, rel=0.15)
         assert step.overshoot == pytest.approx(0.09, abs=0.025)
         assert abs(step.steady_state_error) < 4e-3
+
+
+SIZES = {"low": 0.0, "high": 500.0}
+effect_file.define({
+    "loop_magnet": {"place": "arm", "term": "-k * (theta - at) * exp(-((theta - at) / width)**2)", "parameters": {
+        "k": {"unit": "1/s²", "default": 20.0, **SIZES}, "at": {"unit": "rad", "default": 0.25, **SIZES},
+        "width": {"unit": "rad", "default": 0.15, "low": 0.01, "high": 2.0}}},
+    "loop_wake": {"place": "thrust", "term": "-share * thrust * sin(3 * theta)**2", "parameters": {
+        "share": {"unit": "-", "default": 0.3, **SIZES}}},
+    "loop_hose": {"place": "arm", "term": "-k * z",
+                  "memory": {"name": "z", "unit": "rad", "rate": "theta_dot - z / tau"},
+                  "parameters": {"k": {"unit": "1/s²", "default": 8.0, **SIZES},
+                                 "tau": {"unit": "s", "default": 0.6, "low": 0.01, "high": 9.0}}},
+}, "test_feedback_linearization")
+
+
+@pytest.mark.parametrize("effect", ["loop_magnet", "loop_wake", "loop_hose"])
+def test_an_effect_by_formula_is_compensated(effect):
+    """What is left of the excess in settling time and overshoot, beside a law that does not know the effect."""
+    rig = BENCH.with_effects({effect: {n: p.default for n, p in DEFINED[effect].parameters.items()}})
+    gains = tune(BENCH)
+    nominal, blind, seeing = (answers(FeedbackLinearization(known, gains), plant, levels=(0.3,), hold=3.5)[0]
+                              for known, plant in ((BENCH, BENCH), (BENCH, rig), (rig, rig)))
+
+    def excess(step):
+        return (abs(step.overshoot - nominal.overshoot) / nominal.overshoot
+                + abs(step.settling_time - nominal.settling_time) / nominal.settling_time)
+
+    assert excess(seeing) < 0.5 * excess(blind)
 
 
 def test_without_an_error_the_thrust_holds_the_weight():
