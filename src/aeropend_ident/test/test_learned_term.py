@@ -4,8 +4,10 @@
 import numpy as np
 import pytest
 
+from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.results import Results, document
+from aeropend_ident.diagnosis.search.hypotheses import hypotheses
 from aeropend_ident.diagnosis.search.learned_term import FORMS, Curve, definition
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, recorded, steps
 from aeropend_sim.model import effect_file
@@ -80,6 +82,16 @@ def test_a_formula_is_proposed_and_is_tomorrows_catalogue_entry(verdict, tmp_pat
     again = diagnose(BENCH, [recorded(105, {id_: {}}, duration=30.0)], 2, further=[formulas[0].id])
     assert again.conclusions.which.verdict == formulas[0].id
     assert again.conclusions.closure.closed > 0.9
+
+
+def test_what_is_left_out_or_added_stays_so_when_chains_are_cut_again():
+    chains = CutChains(BENCH, [recorded(104, {}, duration=10.0)])
+    chains.further, chains.left_out = ("hidden_hose",), ("gust",)
+    again = chains.anew(chains.recordings)
+    assert (again.further, again.left_out, again.known) == (("hidden_hose",), ("gust",), None)
+    names = {h.name for h in hypotheses(BENCH, again.further, again.left_out)}
+    assert "hidden_hose" in names
+    assert "gust" not in names
 
 
 def test_every_form_makes_an_effect_whose_units_are_right():

@@ -281,9 +281,7 @@ def _fitted_further(fitted: CutChains) -> CutChains:
     further = _further(s)
     note = (f"after {s.train * s.period:.1f} s the rig behaves otherwise than before: the fit goes on up to "
             f"{further * s.period:.1f} s, only the rest is held out")
-    longer = type(fitted)(fitted.model, [replace(s, train=further).noted(note)], fitted.policy)
-    longer.known, longer.further, longer.left_out = fitted.known, fitted.further, fitted.left_out
-    return longer
+    return fitted.anew([replace(s, train=further).noted(note)])
 
 
 def _further(s: Signals) -> int:
@@ -385,6 +383,7 @@ def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Finding
                              recordings, failed)
     if not fitted.policy.driven:  # a decay has few swings: effects are selected on all of them
         chains = CutChains(fitted.model, [replace(s, train=len(s)) for s in recordings], fitted.policy)
+        chains.further, chains.left_out = fitted.further, fitted.left_out
     deadline = None if settings.seconds is None else time.monotonic() + settings.seconds
 
     def searched(chains: CutChains) -> dict[str, Findings]:

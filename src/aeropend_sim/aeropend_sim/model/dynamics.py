@@ -63,6 +63,9 @@ SAMPLED = 64
 RATIO = 0.5 * (math.sqrt(5.0) - 1.0)
 """Golden ratio: its multiples fill an interval evenly (derived)."""
 
+MOST_TERM_STEPS = 32
+"""Greatest number of steps of a hold for terms by formula. A choice: a friction that bends within 1 mrad/s needs 20."""
+
 MOST_STEPS = 1000
 """Greatest number of steps of a hold, also for the fastest plant. A choice."""
 
@@ -840,7 +843,7 @@ def steps_in(model: Model, period: float) -> int:
             rates += [e.mast_flex_omega / math.sqrt(free) / 0.3,
                       2.0 * e.mast_flex_zeta * e.mast_flex_omega / free / 0.3]
     if added is not None:
-        rates += [rate / 0.3 for rate in term_rates(n, top_speed, added)]
+        rates += [min(rate / 0.3, MOST_TERM_STEPS / period) for rate in term_rates(n, top_speed, added)]
     return min(MOST_STEPS, math.ceil(period * max(rates) - 1e-9))
 
 

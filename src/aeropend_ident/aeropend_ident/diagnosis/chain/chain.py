@@ -274,6 +274,17 @@ class CutChains:
         self.notes: tuple[str, ...] = ()  # what the recordings do not tell of the nominal model of a driven rig
         self.each = [self._cut(signals) for signals in recordings]
 
+    def anew(self, recordings: Sequence[Signals]) -> CutChains:
+        """The same chains cut from other recordings, with all that is known and tried.
+
+        Args:
+            recordings: of the same rig.
+        """
+        out = type(self)(self.model, recordings, self.policy)
+        for name in ("likely", "plain", "known", "further", "left_out", "notes"):
+            setattr(out, name, getattr(self, name))
+        return out
+
     def _cut(self, signals: Signals) -> CutChain:
         return CutChain.cut(self.model, signals)
 

@@ -156,7 +156,7 @@ def suspected(chains: CutChains, findings: Mapping[str, Findings]) -> list[Windo
     """
     if len(chains.each) > 1 or not chains.policy.calibrated:
         return []
-    every = hypotheses(chains.model, mismatches=False)
+    every = hypotheses(chains.model, chains.further, chains.left_out, mismatches=False)
     for stage in STAGES:
         f = findings[stage]
         if not f.base.residuals or passes_as_noise(f.final, MATERIAL):
@@ -169,7 +169,7 @@ def suspected(chains: CutChains, findings: Mapping[str, Findings]) -> list[Windo
 def with_window(chains: CutChains, window: Window) -> CutChains:
     """The chains of one recording cut again, with effects that act only within a window."""
     (signals,) = chains.recordings
-    return type(chains)(chains.model, [replace(signals, window=window)], chains.policy)
+    return chains.anew([replace(signals, window=window)])
 
 
 def is_better(once: Mapping[str, Findings], again: Mapping[str, Findings], chains: CutChains) -> bool:
