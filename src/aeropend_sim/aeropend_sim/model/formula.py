@@ -17,10 +17,9 @@ from fractions import Fraction
 from functools import cache
 from typing import Any
 
-import numba
 from numba import types
 
-from aeropend_sim.compiled import njit
+from aeropend_sim.compiled import c_function, njit
 from aeropend_sim.errors import UserError
 
 LONGEST = 2000
@@ -423,4 +422,4 @@ def compiled(text: str, parameters: tuple[str, ...], memory: str = "") -> Any:
     function.body[0].body[0].value.right = body  # type: ignore[attr-defined]
     names: dict[str, Any] = {f"f_{name}": f.call for name, f in FUNCTIONS.items()}
     exec(compile(ast.fix_missing_locations(function), "<formula>", "exec"), names)  # noqa: S102 - of checked parts
-    return numba.cfunc(SIGNATURE, error_model="numpy")(names["formula"])
+    return c_function(SIGNATURE, names["formula"])

@@ -15,7 +15,7 @@ import yaml
 
 from aeropend_sim.errors import UserError
 from aeropend_sim.model import effect_file
-from aeropend_sim.model.effects import DEFINED, PARAMETER_MISMATCH
+from aeropend_sim.model.effects import CATALOGUE, DEFINED, PARAMETER_MISMATCH
 from aeropend_sim.untrusted import NumberLoader, load_yaml, printable
 
 SAMPLE_PERIOD = 64 * 510 / 16e6
@@ -224,9 +224,9 @@ def with_definitions(flat: Mapping[str, object], name: str) -> dict[str, object]
 
 def _read_effect(effects: dict[str, dict[str, float]], rest: str, value: object, where: str) -> None:
     id_, _, parameter = rest.partition(".")
-    known = (*DEFINED, PARAMETER_MISMATCH)
-    if id_ not in known:
-        raise _unknown("effect", id_, known, where)
+    if id_ not in DEFINED and id_ != PARAMETER_MISMATCH:
+        near = difflib.get_close_matches(id_, DEFINED, n=1)
+        raise _unknown("effect", id_, tuple(near) or (*CATALOGUE, PARAMETER_MISMATCH), where)
     if not parameter:
         example = "R_a: 1.2" if id_ == PARAMETER_MISMATCH else (
             f"{DEFINED[id_].size}: {DEFINED[id_].parameters[DEFINED[id_].size].default:g}")

@@ -62,7 +62,7 @@ FIXED = 1e-6
 """Standard deviation of the gain of the term, which is 1: its points have the size (choice: it does not move)."""
 
 SURE = 1e6
-"""Log evidence of a term that is needed in any case: the verdict is that an effect is unknown."""
+"""Log evidence of a term that is needed in any case (choice: far above any, the verdict is `unknown` already)."""
 
 NAME = "learned"
 """The beginning of the id of a learned term."""
