@@ -22,6 +22,7 @@ from aeropend_ident.testing import bags, rigs
 from aeropend_sim import record
 from aeropend_sim.cli.completion import commands
 from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.forms import FORMS
 from aeropend_sim.model.parameters import PARAMETERS, SAMPLE_PERIOD, load
 from aeropend_sim.ros import interface
 
@@ -75,6 +76,18 @@ def test_a_row_gives_place_parameters_and_units(effect):
 def test_the_equation_of_an_effect_is_that_of_the_catalogue(effect):
     text = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
     assert f"- `{effect.id}`: {effect.physics}\n" in text
+
+
+@pytest.mark.parametrize("form", FORMS.values(), ids=lambda e: e.id)
+def test_a_form_has_its_row(form):
+    text = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
+    (row,) = re.findall(rf"^\| {form.id} \| `(\w+)` \| `(.*?)`(.*) \| (.*) \|$", text, re.MULTILINE)
+    of, term, more, own = row
+    assert (of, term) == (form.form_of, form.term)
+    assert (f"d{form.memory}/dt = `{form.rate}`" in more) == bool(form.memory)
+    assert ("sticks" in more) == form.sticks
+    new = [(n, p.unit) for n, p in form.parameters.items() if n not in CATALOGUE[of].parameters and not p.refines]
+    assert re.findall(r"`(\w+)` ([^,|]+)", own) == new
 
 
 def keys(schema):

@@ -35,12 +35,12 @@ class Allocation:
         model = observer.model
         self._observer, self._numbers = observer, model.numbers()
         self.thrust_time = thrust_time
-        self._bridge_drop = model.effect("bridge_drop", "v_drop")
-        self._supply_drift = model.effect("supply_drift", "rate")
-        self._supply_resistance = model.effect("supply_sag", "r_supply")
+        self._bridge_drop = model.in_any_form("bridge_drop", "v_drop")
+        self._supply_drift = model.in_any_form("supply_drift", "rate")
+        self._supply_resistance = model.in_any_form("supply_sag", "r_supply")
         self._heating = model.effect("winding_heating", "gain")
-        self._brush_drop = model.effect("brush_drop", "v_brush")
-        self._rotor_friction = model.effect("rotor_friction", "torque")
+        self._brush_drop = model.in_any_form("brush_drop", "v_brush")
+        self._rotor_friction = model.in_any_form("rotor_friction", "torque")
         self._thrust_lag = model.effect("thrust_lag", "tau")
         self._thrust_exponent = model.effect("thrust_exponent", "n")
 

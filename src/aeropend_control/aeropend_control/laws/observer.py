@@ -207,7 +207,7 @@ def _observe(theta: float, volts: Array, s: dynamics.State, m: sensing.Memory, g
     sine, motion = math.sin(p.theta), dynamics.Motion(p.theta, p.theta_dot, 0.0, 0.0)
     drive = dynamics.arm_drive(sine, motion, 0.0, p.omega, 0.0, c, e)
     if added is not None:
-        drive += dynamics.arm_terms(motion, p.thrust, p.omega, dynamics.Past(p.time, p.memory), c, added)
+        drive += dynamics.arm_terms(motion, p.thrust, p.omega, 0.0, dynamics.Past(p.time, p.memory), c, added)
     nominal = dynamics.arm_drive(sine, motion, 0.0, p.omega, 0.0, c, None)
     return s, m, (p, drive, nominal, dynamics.near_ground(p.theta, e))
 

@@ -57,7 +57,7 @@ class PositionLaw:
         self._observer = Observer(model, period, self.reads_motor)
         self._pid = PID(0.0, period=period, exact=True)
         self._allocation = Allocation(self._observer)
-        self._arm_friction = model.effect("coulomb_friction", "accel")
+        self._arm_friction = model.in_any_form("coulomb_friction", "accel")
         self._apply()
         self.reset()
 

@@ -250,11 +250,34 @@ def rotor_terms(i: float, w: float, v: float, p: Past, added: Terms) -> float:
 
 
 @equation
-def arm_terms(motion: Motion, f: float, w: float, p: Past, c: Coefficients, added: Terms) -> float:
-    """[rad/s²] Sum of the terms by formula of the thrust and on the arm, over the arm's inertia."""
+def arm_terms(motion: Motion, f: float, w: float, direction: float, p: Past, c: Coefficients, added: Terms) -> float:
+    """[rad/s²] Sum of the terms by formula of the thrust and on the arm, over the arm's inertia.
+
+    Args:
+        motion: of the arm.
+        f: [N] thrust.
+        w: [rad/s] speed of the rotor.
+        direction: sign of the motion, which dry friction opposes; 0: without dry friction.
+        p: time and memories.
+        c: coefficients.
+        added: terms by formula.
+    """
     q = Quantities(motion.theta, motion.theta_dot, w, f, 0.0, 0.0, p.time)
-    return (c.lever * term_sum(added.rotor, added.thrust, q, p.memory, added)
-            + term_sum(added.thrust, added.arm, q, p.memory, added))
+    total = (c.lever * term_sum(added.rotor, added.thrust, q, p.memory, added)
+             + term_sum(added.thrust, added.arm, q, p.memory, added))
+    if added.arm_friction > added.rotor_friction and direction != 0.0:
+        total -= direction * max(term_sum(added.rotor_friction, added.arm_friction, q, p.memory, added), 0.0)
+    return total
+
+
+@equation
+def grip(theta: float, f: float, w: float, past: Pasts | None, e: Values, added: Terms | None) -> float:
+    """[rad/s²] Dry friction of the arm at rest, over its inertia."""
+    limit = e.coulomb_friction_accel
+    if added is not None and added.arm_friction > added.rotor_friction:
+        q = Quantities(theta, 0.0, w, f, 0.0, 0.0, past.start.time)
+        limit += max(term_sum(added.rotor_friction, added.arm_friction, q, past.start.memory, added), 0.0)
+    return limit
 
 
 @equation
@@ -321,8 +344,12 @@ def winding_rotor(i0: float, w0: float, v: float, heat: float, past: Pasts | Non
         Current in the middle and at the end, speed in the middle and at the end.
     """
     friction, sticks = 0.0, False
-    if e is not None and e.rotor_friction_torque > 0.0:
+    if e is not None:
         friction = e.rotor_friction_torque / x.J_m
+    if added is not None and added.rotor_friction > added.arm:
+        q = Quantities(0.0, 0.0, w0, 0.0, i0, v, past.start.time)
+        friction += max(term_sum(added.arm, added.rotor_friction, q, past.start.memory, added), 0.0) / x.J_m
+    if e is not None and friction > 0.0:
         drive = c.torque * i0
         sticks = w0 == 0.0 and abs(drive) <= friction
         if w0 < 0.0 or (w0 == 0.0 and drive < 0.0):
@@ -536,7 +563,7 @@ def flex_restoring(flex: float, flex_dot: float, e: Values) -> float:
 
 
 @equation
-def arm(motion: Motion, thrust: Over, speed: Over, friction: float, gust: float, past: Pasts | None, c: Coefficients,
+def arm(motion: Motion, thrust: Over, speed: Over, direction: float, gust: float, past: Pasts | None, c: Coefficients,
         e: Values | None, x: Extra | None, added: Terms | None) -> Motion:
     """The arm, and the mode of the mast, over one step by the Runge-Kutta-Nyström method of fourth order.
 
@@ -544,7 +571,7 @@ def arm(motion: Motion, thrust: Over, speed: Over, friction: float, gust: float,
         motion: at the start.
         thrust: [N] thrust, without the ground effect.
         speed: [rad/s] speed of the rotor.
-        friction: [rad/s²] dry friction over inertia, with the sign of the motion.
+        direction: sign of the motion, which dry friction opposes; 0: without dry friction.
         gust: [rad/s²] random torque over inertia, constant.
         past: time and memories; None without terms.
         c: coefficients.
@@ -557,7 +584,7 @@ def arm(motion: Motion, thrust: Over, speed: Over, friction: float, gust: float,
     """
     y, yd, q, qd = motion
     s = 0.5 * c.h
-    torque = gust - friction
+    torque = gust if e is None else gust - direction * e.coulomb_friction_accel
     # One sine and cosine, in the middle. Those of the ends follow by rotation, so that the stages need not wait for
     # each other. The ground effect likewise: where the arm would be without acceleration, then moved a little.
     d = s * yd
@@ -567,22 +594,22 @@ def arm(motion: Motion, thrust: Over, speed: Over, friction: float, gust: float,
     sin_1, cos_1 = sin_m * cos_d + cos_m * sin_d, cos_m * cos_d - sin_m * sin_d
     g0, gm, g1 = near_ground(y, e), near_ground(y + d, e), near_ground(y + 2.0 * d, e)
     f0 = thrust.start + thrust.start * g0
-    more = torque if added is None else torque + arm_terms(motion, f0, speed.start, past.start, c, added)
+    more = torque if added is None else torque + arm_terms(motion, f0, speed.start, direction, past.start, c, added)
     a1, b1 = arm_stage(sin_m * cos_d - cos_m * sin_d, motion, f0, speed.start, more, c, e, x)
     bend = 0.5 * s * s * a1
     sin_m, middle, qm = near(sin_m, cos_m, bend), y + d + bend, q + s * (qd + 0.5 * s * b1)
     fm = thrust.middle + thrust.middle * nearer_ground(gm, y + d, middle, e, x)
     second = Motion(middle, yd + s * a1, qm, qd + s * b1)
-    more = torque if added is None else torque + arm_terms(second, fm, speed.middle, past.middle, c, added)
+    more = torque if added is None else torque + arm_terms(second, fm, speed.middle, direction, past.middle, c, added)
     a2, b2 = arm_stage(sin_m, second, fm, speed.middle, more, c, e, x)
     third = Motion(middle, yd + s * a2, qm, qd + s * b2)
-    more = torque if added is None else torque + arm_terms(third, fm, speed.middle, past.middle, c, added)
+    more = torque if added is None else torque + arm_terms(third, fm, speed.middle, direction, past.middle, c, added)
     a3, b3 = arm_stage(sin_m, third, fm, speed.middle, more, c, e, x)
     bend = c.h * s * a3
     end = y + 2.0 * d + bend
     last = Motion(end, yd + c.h * a3, q + c.h * (qd + s * b3), qd + c.h * b3)
     f1 = thrust.end + thrust.end * nearer_ground(g1, y + 2.0 * d, end, e, x)
-    more = torque if added is None else torque + arm_terms(last, f1, speed.end, past.end, c, added)
+    more = torque if added is None else torque + arm_terms(last, f1, speed.end, direction, past.end, c, added)
     a4, b4 = arm_stage(near(sin_1, cos_1, bend), last, f1, speed.end, more, c, e, x)
     return Motion(
         y + c.h * (yd + s * (1.0 / 3.0) * (a1 + a2 + a3)), yd + s * (1.0 / 3.0) * (a1 + 2.0 * (a2 + a3) + a4),
@@ -646,25 +673,25 @@ def arm_with_dry_friction(motion: Motion, thrust: Over, speed: Over, gust: float
         The motion at the end.
     """
     y, yd, q, qd = motion
-    limit = e.coulomb_friction_accel
     direction = 1.0 if yd > 0.0 else -1.0
     if yd == 0.0:
         f = thrust.start * (1.0 + near_ground(y, e))
-        torque = gust if added is None else gust + arm_terms(motion, f, speed.start, past.start, c, added)
+        torque = gust if added is None else gust + arm_terms(motion, f, speed.start, 0.0, past.start, c, added)
         drive = arm_drive(math.sin(y), motion, f, speed.start, torque, c, e)
-        if abs(drive) <= limit:  # it sticks; the mast swings on alone
+        if abs(drive) <= grip(y, f, speed.start, past, e, added):  # it sticks; the mast swings on alone
             q, qd = mast_alone(q, qd, c, e)
             return Motion(y, 0.0, q, qd)
         direction = 1.0 if drive > 0.0 else -1.0
-    after = arm(motion, thrust, speed, direction * limit, gust, past, c, e, x, added)
+    after = arm(motion, thrust, speed, direction, gust, past, c, e, x, added)
     if yd == 0.0 or yd * after.theta_dot > 0.0:
         return after
     reached = yd / (yd - after.theta_dot) if yd != after.theta_dot else 1.0
     turn = y + 0.5 * reached * c.h * yd
     f = (thrust.start + reached * (thrust.end - thrust.start)) * (1.0 + near_ground(turn, e))
     resting = Motion(turn, 0.0, after.flex, after.flex_dot)
-    torque = gust if added is None else gust + arm_terms(resting, f, speed.end, past.end, c, added)
+    torque = gust if added is None else gust + arm_terms(resting, f, speed.end, 0.0, past.end, c, added)
     drive = arm_drive(math.sin(turn), resting, f, speed.end, torque, c, e)
+    limit = grip(turn, f, speed.end, past, e, added)
     if abs(drive) <= limit:
         return resting
     rest = (1.0 - reached) * c.h
@@ -766,7 +793,10 @@ def advance_arm(state: State, wm: float, w1: float, past: Pasts | None, c: Coeff
         fm, f1 = (k.half_decay * f0 + k.u0 * s0 + k.u1 * sm + k.u2 * s1,
                   k.decay * f0 + k.w0 * s0 + k.w1 * sm + k.w2 * s1)
     motion = Motion(state.theta, state.theta_dot, state.flex, state.flex_dot)
-    if e.coulomb_friction_accel > 0.0:
+    sticks = e.coulomb_friction_accel > 0.0
+    if added is not None:
+        sticks = sticks or added.arm_friction > added.rotor_friction
+    if sticks:
         return arm_with_dry_friction(motion, Over(f0, fm, f1), speed, state.gust, past, c, e, x, added), f1
     return arm(motion, Over(f0, fm, f1), speed, 0.0, state.gust, past, c, e, x, added), f1
 

@@ -12,6 +12,7 @@ import yaml
 
 from aeropend_sim.errors import UserError
 from aeropend_sim.model.effects import CATALOGUE, DEFINED, PARAMETER_MISMATCH, PLACES, Effect, EffectParameter
+from aeropend_sim.model.forms import FORMS
 from aeropend_sim.model.formula import CONSTANTS, FUNCTIONS, QUANTITIES, FormulaError, dimension, parse
 from aeropend_sim.untrusted import NumberLoader, load_yaml, one_line, printable
 
@@ -34,7 +35,7 @@ MOST_PARAMETERS = 60
 """Greatest number of parameters of an effect. A choice: a learned term has up to 44."""
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,39}")
-_KEYS = ("place", "physics", "term", "reading", "memory", "parameters")
+_KEYS = ("place", "physics", "form_of", "term", "sticks", "reading", "memory", "parameters")
 _PARAMETER_KEYS = ("unit", "neutral", "default", "low", "high", "description", "refines")
 
 
@@ -118,18 +119,22 @@ def unit_of(place: str, reading: str = "") -> str:
 
 def forget(id_: str) -> None:
     """Make an effect by formula unknown again, of which no model is left."""
-    if id_ not in CATALOGUE:
+    if id_ not in CATALOGUE and id_ not in FORMS:
         DEFINED.pop(id_, None)
 
 
 def definitions(ids: object) -> dict[str, dict[str, object]]:
     """The definitions of those effects among some ids that are given by a formula; the inverse of `define`."""
     return {effect.id: _written(effect) for id_ in ids  # type: ignore[attr-defined]
-            if (effect := DEFINED.get(id_)) is not None and effect.term}
+            if id_ not in FORMS and (effect := DEFINED.get(id_)) is not None and effect.term}
 
 
 def _written(effect: Effect) -> dict[str, object]:
     tree: dict[str, object] = {"place": effect.place, "physics": effect.physics, "term": effect.term}
+    if effect.form_of:
+        tree["form_of"] = effect.form_of
+    if effect.sticks:
+        tree["sticks"] = True
     if effect.reading:
         tree["reading"] = effect.reading
     if effect.memory:
@@ -145,7 +150,7 @@ def _effect(id_: str, tree: object, where: str) -> Effect:
     at = f"{where}: {one_line(id_)}"
     if not _NAME.fullmatch(id_) or id_ in ("initial", "sensing", "model"):
         raise EffectError(f"{at}: not an id; use letters, digits and _, a letter first")
-    if id_ in CATALOGUE or id_ == PARAMETER_MISMATCH:
+    if id_ in CATALOGUE or id_ in FORMS or id_ == PARAMETER_MISMATCH:
         raise EffectError(f"{at}: an effect of the catalogue has this id; choose another one")
     if not isinstance(tree, Mapping):
         raise EffectError(f"{at}: give place, physics, term and parameters")
@@ -158,20 +163,29 @@ def _effect(id_: str, tree: object, where: str) -> Effect:
         raise EffectError(f"{at}: its reading is {_shown(reading)}; give one of {', '.join(READINGS)}")
     if place != "sensing" and reading:
         raise EffectError(f"{at}: only an effect at place sensing has a reading; leave it out")
+    form_of, sticks = tree.get("form_of", ""), tree.get("sticks", False)
+    if form_of and (form_of not in CATALOGUE or CATALOGUE[str(form_of)].place != place):
+        raise EffectError(f"{at}: form_of is {_shown(form_of)}; give an effect of the catalogue at place {place}")
+    if not isinstance(sticks, bool) or (sticks and place not in ("rotor", "arm")):
+        raise EffectError(f"{at}: sticks is true or false, and true only for a friction of the rotor or the arm")
     memory, memory_unit, rate = _memory(tree.get("memory"), at)
     if memory and place == "sensing":
         raise EffectError(f"{at}: an effect at place sensing cannot have a memory yet")
     effect = Effect(id_, str(place), _text(tree.get("physics", ""), "physics", at), _parameters(tree, at, memory),
                     term=_text(tree.get("term"), "term", at), reading=str(reading), memory=memory,
-                    memory_unit=memory_unit, rate=rate)
+                    memory_unit=memory_unit, rate=rate, sticks=sticks, form_of=str(form_of))
     try:
-        return _checked(effect)
+        return checked(effect)
     except FormulaError as error:
         raise EffectError(f"{at}: {error}") from None
 
 
-def _checked(effect: Effect) -> Effect:
-    """The effect, its formulas parsed and their units checked."""
+def checked(effect: Effect) -> Effect:
+    """The effect, its formulas parsed and their units checked.
+
+    Raises:
+        FormulaError: a formula cannot be used.
+    """
     unit, uses = READINGS[effect.reading] if effect.reading else (UNITS[effect.place], USES[effect.place])
     units = {name: QUANTITIES[name] for name in uses} | {n: p.unit for n, p in effect.parameters.items()}
     if effect.memory:

@@ -127,6 +127,17 @@ class Model:
         """
         return float(self.effects.get(id_, {}).get(parameter, DEFINED[id_].parameters[parameter].neutral))
 
+    def in_any_form(self, id_: str, parameter: str) -> float:
+        """A parameter of an effect, in whatever form the model has it; its neutral value if it has none.
+
+        Args:
+            id_: the effect's id in the catalogue.
+            parameter: name of its parameter.
+        """
+        forms = (p[parameter] for form, p in self.effects.items()
+                 if form in DEFINED and DEFINED[form].form_of == id_ and parameter in p)
+        return next(map(float, forms), self.effect(id_, parameter))
+
     def with_effects(self, effects: Mapping[str, Mapping[str, float]]) -> Model:
         """The same model with other effects.
 

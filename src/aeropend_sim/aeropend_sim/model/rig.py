@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_sim.model import actuator, dynamics, sensing
-from aeropend_sim.model.effects import CATALOGUE, DEFINED
+from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 
 Array = NDArray[np.float64]
@@ -104,8 +104,7 @@ class Rig:
 
 def _with_errors(model: Model, truth: Array, theta: Array, theta_dot: Array) -> Array:
     """The states (7, N) as the sensors see them: with the errors of readings that are given by formulas."""
-    errors = {e.reading for id_ in model.effects if (e := DEFINED.get(id_)) is not None and e.reading}
-    if not errors:
+    if not sensing.readings_with_errors(model):
         return truth
     seen, row = truth.copy(), dynamics.ROW
     seen[row.theta], seen[row.theta_dot] = theta, theta_dot

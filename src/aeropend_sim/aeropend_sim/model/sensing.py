@@ -85,6 +85,12 @@ class Memory(NamedTuple):
 ScalarOrArray = TypeVar("ScalarOrArray", float, Array)
 
 
+
+def readings_with_errors(model: Model) -> set[str]:
+    """The readings that effects by formula add errors to."""
+    return {e.reading for id_ in model.effects if (e := DEFINED.get(id_)) is not None and e.term and e.reading}
+
+
 def read_current(model: Model, current: ScalarOrArray) -> ScalarOrArray:
     """Reading of a current before noise and quantisation.
 
@@ -124,14 +130,14 @@ def true_voltage(model: Model, reading: ScalarOrArray) -> ScalarOrArray:
     """
     first = reading - model.effect("voltage_offset", "bias")
     true = first
-    for _ in range(REPEATED if any(DEFINED[id_].reading == "v_a" for id_ in model.effects if id_ in DEFINED) else 0):
+    for _ in range(REPEATED if "v_a" in readings_with_errors(model) else 0):
         true = first - _error(model, "v_a", v=true)
     return true
 
 
 def _error(model: Model, channel: str, **known: ScalarOrArray) -> ScalarOrArray:
     """The error of a reading that formulas give, in the shape of the quantity that it depends on; 0.0 without any."""
-    if not any(DEFINED[id_].reading == channel for id_ in model.effects if id_ in DEFINED):
+    if channel not in readings_with_errors(model):
         return 0.0  # type: ignore[return-value]
     (value,) = known.values()
     found = series(model.effects, channel, np.size(value), 0.0, **{name: np.ravel(x) for name, x in known.items()})
@@ -148,7 +154,7 @@ def seen_angle(model: Model, theta: Array, theta_dot: Array, period: float, star
         period: [s] time between samples.
         start: [s] time of the first sample.
     """
-    if not any(DEFINED[id_].reading == "theta" for id_ in model.effects if id_ in DEFINED):
+    if "theta" not in readings_with_errors(model):
         return theta, theta_dot
 
     def error(ahead: float) -> Array:

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from aeropend_sim.compiled import njit
 from aeropend_sim.errors import UserError
-from aeropend_sim.model.effects import DEFINED, is_active
+from aeropend_sim.model.effects import DEFINED, Effect, is_active
 from aeropend_sim.model.formula import QUANTITIES, compiled
 
 Array = NDArray[np.float64]
 
-PLACES = ("actuator", "electrical", "rotor", "thrust", "arm")
-"""The places whose terms are in the equations."""
+PLACES = ("actuator", "electrical", "rotor", "thrust", "arm", "rotor friction", "arm friction")
+"""Where the equations take terms: the places of the chain, and the sizes of the dry friction at two of them."""
 
 SLOTS = 4
 """Greatest number of effects by formula with a memory in one model. A choice."""
@@ -55,7 +55,7 @@ class Terms(NamedTuple):
         calls: address of a table of whole numbers, a row a term in the order of places: address of the term, address of
             the rate of its memory or 0, slot of the memory, address of its parameters.
         memories: number of effects with a memory.
-        actuator: end of the rows of this place, and so on.
+        actuator: end of the rows of this place, and so on in the order of `PLACES`.
     """
 
     calls: int
@@ -65,6 +65,8 @@ class Terms(NamedTuple):
     rotor: int
     thrust: int
     arm: int
+    rotor_friction: int
+    arm_friction: int
 
 
 class _Held(Terms):
@@ -91,19 +93,24 @@ def terms(effects: Mapping[str, Mapping[str, float]], places: Sequence[str] = PL
         UserError: more than `SLOTS` of them have a memory.
     """
     active = sorted(((e, p) for id_, p in effects.items() if (e := DEFINED.get(id_)) is not None and e.term
-                     and (e.reading or e.place) in places and is_active(id_, p)),
-                    key=lambda one: places.index(one[0].reading or one[0].place))
+                     and _where(e) in places and is_active(id_, p)), key=lambda one: places.index(_where(one[0])))
     if not active:
         return None
     rows, memories = [], 0
     for e, p in active:
         own = tuple(e.parameters)
         rate = compiled(e.rate, own, e.memory).address if e.memory else 0
-        rows.append((compiled(e.term, own, e.memory).address, rate, min(memories, SLOTS), [p[name] for name in own]))
+        numbers = [p.get(name, q.neutral) for name, q in e.parameters.items()]
+        rows.append((compiled(e.term, own, e.memory).address, rate, min(memories, SLOTS), numbers))
         memories += bool(e.memory)
     if memories > SLOTS:
         raise UserError(f"{memories} effects by formula with a memory; {SLOTS} are possible in one model")
-    return _held(rows, [sum((e.reading or e.place) in places[:k + 1] for e, _ in active) for k in range(len(PLACES))])
+    return _held(rows, [sum(_where(e) in places[:k + 1] for e, _ in active) for k in range(len(PLACES))])
+
+
+def _where(e: Effect) -> str:
+    """Where the equations, or a reading, take the term of an effect."""
+    return e.reading or (f"{e.place} friction" if e.sticks else e.place)
 
 
 def _held(rows: Sequence[tuple[int, int, int, Sequence[float]]], ends: Sequence[int]) -> Terms:
@@ -182,7 +189,7 @@ def remembered(memory: Memory, near: Memory, q: Quantities, h: float, x: Terms) 
         x: terms.
     """
     out = memory
-    for j in range(x.arm):
+    for j in range(x.arm_friction):
         rate = _entry(x.calls, j, 1)
         if rate != 0:
             slot, numbers = _entry(x.calls, j, 2), _entry(x.calls, j, 3)
@@ -202,7 +209,7 @@ def _series(values: Array, h: float, x: Terms, out: Array) -> None:
     for k in range(values.shape[1]):
         q = Quantities(values[0, k], values[1, k], values[2, k], values[3, k], values[4, k], values[5, k],
                        values[6, k])
-        out[k] = term_sum(0, x.arm, q, memory, x)
+        out[k] = term_sum(0, x.arm_friction, q, memory, x)
         if x.memories > 0:
             middle = remembered(memory, memory, q, 0.5 * h, x)
             memory = remembered(memory, middle, q, h, x)
