@@ -6,6 +6,7 @@
     make blind ARGS="--uncalibrated --count 120"    uncalibrated rigs
     make blind ARGS="--circumstances --count 100"   rigs as they are: many imperfections, feedback, lost samples
     make blind ARGS="--without --count 60"          what the catalogue does not hold: flagged, placed, learned
+    make blind ARGS="--forms --count 60"            effects that follow another law than the catalogue has
     make blind ARGS=--docs                          the table of the last run goes into docs/results/blind.md
 
 Steps can be run alone: --steps make,diagnose,peers,score. The labels stay sealed until every verdict is written.
@@ -31,6 +32,7 @@ from evaluation.blind import (
     cases,
     circumstances,
     folder,
+    forms,
     limit,
     open_set,
     page,
@@ -151,6 +153,7 @@ def main() -> None:
                         help="pairs of recordings of one rig between which something was changed, or nothing")
     parser.add_argument("--without", action="store_true",
                         help="open set: effects outside the catalogue, and each effect of it left out of the catalogue")
+    parser.add_argument("--forms", action="store_true", help="effects that follow another law than docs/effects.md has")
     parser.add_argument("--docs", action="store_true",
                         help="run nothing, write the table of the last run into docs/results")
     options = parser.parse_args()
@@ -159,11 +162,13 @@ def main() -> None:
         part, name = (("unknown", "uncalibrated") if options.uncalibrated else
                       ("circumstances", "circumstances") if options.circumstances else
                       ("pairs", "pairs") if options.pairs else
-                      ("open_set", "open_set") if options.without else ("", "blind"))
+                      ("open_set", "open_set") if options.without else
+                      ("forms", "forms") if options.forms else ("", "blind"))
         page.write(options.out / part, name)
         return
-    if options.pairs or options.without:
-        name, report_ = ("pairs", pairs.report) if options.pairs else ("open_set", open_set.report)
+    if options.pairs or options.without or options.forms:
+        name, report_ = (("pairs", pairs.report) if options.pairs else ("open_set", open_set.report) if options.without
+                         else ("forms", forms.report))
         out = options.out / name
         out.mkdir(parents=True, exist_ok=True)
         _save(out, report_(options.count, options.seed, options.duration, options.jobs), options)

@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 OFF = 0.05
 """Each nominal number is off by up to this share."""
 
+FORMS = ("table", "other", "third")
+"""The forms of effects: that of docs/effects.md, one that its other forms resemble, and one that is in no catalogue."""
+
 FLOORS = (1.5, 10.0)
 """RMS, in floors, of what no refit of the numbers absorbs, in the channel where it is largest."""
 
@@ -148,7 +151,7 @@ class Sizer:
                    for name in names if self.numbers[name] != 0.0]
         self.q, self.r = np.linalg.qr(np.array(columns).T)
 
-    def packed(self, effects: Mapping[str, Mapping[str, float]], outside: Mapping[str, float], *, other: bool,
+    def packed(self, effects: Mapping[str, Mapping[str, float]], outside: Mapping[str, float], *, other: int,
                numbers: Mapping[str, float] | None = None) -> Array:
         """Parameters of this rig with these effects."""
         return plant.packed(numbers or self.numbers, self.tau, effects, outside, other)
@@ -223,7 +226,7 @@ def gusts_of(entry: Mapping[str, Any], samples: int, *, other: bool) -> Array:
 
 
 def search(id_: str, sizer: Sizer, goal: float, of_size: Callable[[float], dict[str, float]], draw: int, *,
-           other: bool, most: float) -> tuple[dict[str, Any], float]:
+           other: int, most: float) -> tuple[dict[str, Any], float]:
     """An effect at the size that leaves `goal` floors; and its size in floors.
 
     Args:
@@ -232,7 +235,7 @@ def search(id_: str, sizer: Sizer, goal: float, of_size: Callable[[float], dict[
         goal: floors.
         of_size: parameters as a function of the size.
         draw: seed of the effect's chance.
-        other: whether the effect has the other form.
+        other: number of the effect's form.
         most: largest size, in sizes that the search starts from.
     """
     def entry(size: float) -> dict[str, Any]:
@@ -240,7 +243,7 @@ def search(id_: str, sizer: Sizer, goal: float, of_size: Callable[[float], dict[
 
     def make(size: float) -> tuple[Array, Array]:
         return (sizer.packed({id_: of_size(size)}, {}, other=other),
-                gusts_of(entry(size), len(sizer.duty), other=other))
+                gusts_of(entry(size), len(sizer.duty), other=other > 0))
 
     size, left = sizer.size(make, abs(scale(id_)[1]), goal, most)
     return entry(size), left
@@ -249,7 +252,7 @@ def search(id_: str, sizer: Sizer, goal: float, of_size: Callable[[float], dict[
 def sized(id_: str, sizer: Sizer, goal: float, form: str, nominal: Mapping[str, float],
           rng: np.random.Generator) -> tuple[dict[str, object], float]:
     """An effect with its parameters, drawn, sized to leave `goal` floors; and its size in floors."""
-    other = form == "other"
+    other = FORMS.index(form)
     if id_ in OUTSIDE:
         place, start = OUTSIDE[id_]
         if id_ == "current_clip":  # the lower, the larger: sized by what it cuts off
@@ -299,11 +302,11 @@ def draw(name: str, kind: str, effects: list[str], form: str, nominal: Mapping[s
     for e in drawn:
         if e["effect"] == "parameter_mismatch":
             numbers = {**numbers, **e["parameters"]}  # type: ignore[dict-item]
-    p = plant.packed(numbers, sensing["angle_filter_tau"], inside, outside, form == "other")  # type: ignore[arg-type]
+    p = plant.packed(numbers, sensing["angle_filter_tau"], inside, outside, FORMS.index(form))  # type: ignore[arg-type]
     gusts = np.zeros(0)
     for e in drawn:
         if e["effect"] == "gust":
-            gusts = gusts_of(e, len(duty), other=form == "other")
+            gusts = gusts_of(e, len(duty), other=FORMS.index(form) > 0)
         e.pop("draw", None)
     y, v, applied = plant.states(p, duty, gusts, pid(rng) if closed_loop else None)
     columns = plant.measured(p, y, v, sensing, rng)

@@ -59,6 +59,9 @@ States = namedtuple("States", "i omega turned theta rate stage1 stage2 thrust he
                               "slew wake")
 S = States(*range(16))
 
+THIRD = 1.5
+"""Number of the form above which it is the third: one that the catalogue does not hold either."""
+
 BRISTLE = 2e-4
 """[rad] Deflection of the bristles of the dry friction: it sticks and does not creep."""
 
@@ -66,12 +69,16 @@ BRISTLE = 2e-4
 @njit(cache=True)
 def terminal_voltage(duty: float, t: float, y: Array, p: Array) -> float:
     """Armature voltage."""
-    other = p[I.other_form]
+    other, third = p[I.other_form], p[I.other_form] > THIRD
     v = max(0.0, p[I.k0] + p[I.k1] * math.sqrt(max(p[I.k2] * duty + p[I.k3], 0.0)))
     v *= 1.0 + p[I.outside_duty_ripple] * math.sin(6.0 * math.pi * duty)
     if p[I.outside_brown_outs] > 0.0 and math.sin(0.9 * t) + math.sin(1.43 * t + 1.0) > 1.2:
         v *= 1.0 - p[I.outside_brown_outs]
-    if other:
+    if third:  # the battery recovers towards a lower voltage; the switches are bipolar; the supply polarises
+        v *= 1.0 - p[I.supply_drift_rate] * 60.0 * (1.0 - math.exp(-t / 60.0))
+        v = max(0.0, v - p[I.bridge_drop_v_drop] * (1.0 - math.exp(-v / 0.3)))
+        v -= p[I.supply_sag_r_supply] * y[S.i] * abs(y[S.i]) ** -0.15 if y[S.i] != 0.0 else 0.0
+    elif other:
         v *= math.exp(-p[I.supply_drift_rate] * t)
         v = max(0.0, v - p[I.bridge_drop_v_drop] * math.tanh(v / 0.1) * (0.85 + 0.25 * abs(y[S.i])))
         v -= 0.8 * p[I.supply_sag_r_supply] * y[S.i] + y[S.sag]
@@ -100,11 +107,11 @@ def derivative(y: Array, t: float, duty: float, p: Array, gusts: Array, d: Array
 
 @njit(cache=True)
 def _derivative(y: Array, t: float, duty: float, p: Array, gusts: Array, d: Array) -> None:
-    other = p[I.other_form]
+    other, third = p[I.other_form], p[I.other_form] > THIRD
     d[:] = 0.0
     i, w, theta, rate = y[S.i], y[S.omega], y[S.theta], y[S.rate]
     v = terminal_voltage(duty, t, y, p)
-    if other and p[I.supply_sag_r_supply] > 0.0:
+    if other and not third and p[I.supply_sag_r_supply] > 0.0:
         d[S.sag] = (0.2 * p[I.supply_sag_r_supply] * i - y[S.sag]) / 0.15
     if p[I.outside_slew_limit] > 0.0:
         goal = max(0.0, p[I.k0] + p[I.k1] * math.sqrt(max(p[I.k2] * duty + p[I.k3], 0.0)))
@@ -113,7 +120,9 @@ def _derivative(y: Array, t: float, duty: float, p: Array, gusts: Array, d: Arra
     # winding
     r = p[I.R_a] * (1.0 + p[I.winding_heating_gain] * (y[S.heat] + y[S.case]))
     r *= 1.0 + p[I.outside_speed_resistance] * w / 150.0
-    if other:
+    if third:
+        drop = p[I.brush_drop_v_brush] * i / (abs(i) + 0.012)
+    elif other:
         drop = p[I.brush_drop_v_brush] * i / math.sqrt(i * i + 0.02 * 0.02)
     else:
         drop = p[I.brush_drop_v_brush] * math.tanh(i / 0.02)
@@ -121,7 +130,9 @@ def _derivative(y: Array, t: float, duty: float, p: Array, gusts: Array, d: Arra
     d[S.i] = (v - drop - r * i - back) / p[I.L_a]
     if p[I.winding_heating_gain] > 0.0:
         tau = p[I.winding_heating_tau]
-        if other:  # winding and case: the case is three times as heavy and warms behind
+        if third:  # the propeller's wind cools
+            d[S.heat] = i * i - y[S.heat] / tau * (0.7 + w / 300.0)
+        elif other:  # winding and case: the case is three times as heavy and warms behind
             d[S.heat] = 0.8 * i * i - y[S.heat] / (0.7 * tau)
             d[S.case] = 0.2 * i * i - y[S.case] / (2.0 * tau)
         else:
@@ -129,7 +140,9 @@ def _derivative(y: Array, t: float, duty: float, p: Array, gusts: Array, d: Arra
 
     # rotor
     friction = p[I.rotor_friction_torque] * math.tanh(w / 0.3)
-    if other:
+    if third:
+        friction *= 1.0 + 0.4 / (1.0 + (w / 20.0) ** 2)
+    elif other:
         friction *= 1.0 + 0.3 * math.exp(-((w / 15.0) ** 2))
     load = p[I.k_load] * w * abs(w) * (1.0 + p[I.outside_blade_stall] / (1.0 + math.exp(-(w - 130.0) / 6.0)))
     wobble = p[I.outside_gear_wobble] * math.sin(3.1 * t) * math.tanh(w / 20.0)
@@ -140,6 +153,8 @@ def _derivative(y: Array, t: float, duty: float, p: Array, gusts: Array, d: Arra
     n = p[I.thrust_exponent_n]
     if n == 2.0:
         f = p[I.k_thrust] * w * abs(w)
+    elif third:  # a coefficient that levels off
+        f = p[I.k_thrust] * w * abs(w) * (1.0 + 1.6 * (n - 2.0) * (abs(w) - 150.0) / (abs(w) + 150.0))
     elif other:  # a coefficient that falls with the logarithm of the Reynolds number
         f = p[I.k_thrust] * w * abs(w) * (1.0 + (n - 2.0) * math.log(max(abs(w), 1.0) / 150.0))
     else:
@@ -150,17 +165,24 @@ def _derivative(y: Array, t: float, duty: float, p: Array, gusts: Array, d: Arra
         d[S.wake] = (w / 150.0 - y[S.wake]) / 2.0
     if p[I.thrust_lag_tau] > 0.0:
         tau = p[I.thrust_lag_tau]
-        if other:  # the wake fills faster when the rotor turns fast
+        if third:  # two lags in series; the wake's state serves as the first
+            d[S.wake] = (f - y[S.wake]) / (0.35 * tau)
+            f, tau = y[S.wake], 0.65 * tau
+        elif other:  # the wake fills faster when the rotor turns fast
             tau *= 1.3 / (0.3 + abs(w) / 120.0)
         d[S.thrust] = (f - y[S.thrust]) / tau
         f = y[S.thrust]
     f *= 1.0 - p[I.outside_blockage] * math.sin(3.0 * theta) ** 2
     gain, width = p[I.ground_effect_gain], p[I.ground_effect_width]
-    if other:
+    if third:
+        f *= 1.0 + gain / math.cosh(1.3 * theta / width)
+    elif other:
         f *= 1.0 + gain / (1.0 + (theta / width) ** 2)
     else:
         f *= 1.0 + gain * math.exp(-abs(theta) / width)
-    if other and p[I.axial_inflow_k] > 0.0 and abs(w) > 1.0:  # bends as momentum theory has it
+    if third and p[I.axial_inflow_k] > 0.0 and abs(w) > 1.0:
+        f *= math.exp(-p[I.axial_inflow_k] * rate / (p[I.k_thrust] * abs(w)))
+    elif other and p[I.axial_inflow_k] > 0.0 and abs(w) > 1.0:  # bends as momentum theory has it
         x = p[I.axial_inflow_k] * rate / (p[I.k_thrust] * abs(w))
         f *= 1.0 - x / (1.0 + 0.3 * abs(x))
     else:
@@ -173,15 +195,23 @@ def _derivative(y: Array, t: float, duty: float, p: Array, gusts: Array, d: Arra
         bend = 10.0 * BRISTLE if other else BRISTLE
         stiff = fc / bend
         level = fc * (1.0 + (0.25 * math.exp(-((rate / 0.05) ** 2)) if other else 0.0))
+        if third:  # a Tustin curve, and more friction while the cable is wound up
+            level = fc * (0.9 + 0.3 * math.exp(-abs(rate) / 0.1) + 0.15 * theta)
         d[S.bristle] = rate - stiff * abs(rate) / level * y[S.bristle]
         a -= stiff * y[S.bristle] + 0.6 * math.sqrt(stiff) * d[S.bristle] / (1.0 + abs(rate) / 0.05)
     drag = p[I.quadratic_drag_k]
-    if other:
+    if third:  # the propeller's disc drags more on the way up
+        a -= drag * rate * abs(rate) * (1.0 + 0.25 * math.tanh(rate))
+    elif other:
         a -= drag * rate * abs(rate) ** 0.85
     else:
         a -= drag * rate * abs(rate)
     twist = theta - p[I.cable_torque_theta0]
-    a -= p[I.cable_torque_k] * (twist + (0.4 * twist**3 if other else 0.0))
+    if third:  # it stiffens at once
+        twist += 0.35 * twist * abs(twist)
+    elif other:
+        twist += 0.4 * twist**3
+    a -= p[I.cable_torque_k] * twist
     a -= p[I.outside_detent] * math.sin(6.0 * theta)
     a -= p[I.outside_soft_stop] * max(theta - 0.45, 0.0)
     a -= p[I.outside_one_way_drag] * max(rate, 0.0)
@@ -193,7 +223,9 @@ def _derivative(y: Array, t: float, duty: float, p: Array, gusts: Array, d: Arra
     if c > 0.0:  # q̈ + 2ζω q̇ + ω² q = -c θ̈ and θ̈ = a - q̈, solved for both
         o = p[I.mast_flex_omega]
         restoring = 2.0 * p[I.mast_flex_zeta] * o * y[S.flex_rate] + o * o * y[S.flex]
-        if other:
+        if third:  # the mount rubs
+            restoring += 0.4 * o * abs(y[S.flex]) * math.tanh(y[S.flex_rate] / 0.05)
+        elif other:
             restoring += o * o * 20.0 * y[S.flex] ** 3
         bent = (-restoring - c * a) / (1.0 - c)
         d[S.flex], d[S.flex_rate] = y[S.flex_rate], bent
@@ -203,20 +235,24 @@ def _derivative(y: Array, t: float, duty: float, p: Array, gusts: Array, d: Arra
     # encoder and its filter
     shown = theta + p[I.angle_offset_bias] + p[I.encoder_eccentricity_amplitude] * math.sin(
         theta + p[I.encoder_eccentricity_phase])
-    if other:
+    if third:
+        shown += 0.12 * p[I.encoder_eccentricity_amplitude] * math.sin(3.0 * theta + 1.0)
+    elif other:
         shown += 0.15 * p[I.encoder_eccentricity_amplitude] * math.sin(2.0 * theta)
     shown += p[I.outside_encoder_harmonic] * math.sin(5.0 * theta + 1.0)
     lag = p[I.encoder_lag_tau]
     first, second = p[I.filter_tau] + lag, p[I.filter_tau] + lag
-    if other:
+    if third:
+        first, second = p[I.filter_tau] + 1.8 * lag, p[I.filter_tau] + 0.2 * lag
+    elif other:
         first, second = p[I.filter_tau] + 1.4 * lag, p[I.filter_tau] + 0.6 * lag
     d[S.stage1] = (shown - y[S.stage1]) / first
     d[S.stage2] = (y[S.stage1] - y[S.stage2]) / second
 
 
 def packed(numbers: Mapping[str, float], filter_tau: float, effects: Mapping[str, Mapping[str, float]],
-           outside: Mapping[str, float], other: bool) -> Array:
-    """All parameters of a rig as the equations take them."""
+           outside: Mapping[str, float], other: int) -> Array:
+    """All parameters of a rig as the equations take them; `other`: number of the form, 0 for that of the table."""
     flat: dict[str, float] = dict.fromkeys(PARAMETERS, 0.0) | NEUTRAL
     flat |= {**numbers, "filter_tau": filter_tau, "other_form": float(other)}
     flat |= {f"{e}_{q}": v for e, qs in effects.items() for q, v in qs.items() if e in EFFECTS}
@@ -301,7 +337,9 @@ def shown(p: Array, y: Array, v: Array) -> dict[str, Array]:
     """Readings (N,) by channel before noise, quantisation and pulse timing."""
     i = y[:, S.i]
     read = i * (1.0 + p[I.current_gain_gain]) + p[I.current_offset_bias]
-    if p[I.other_form]:
+    if p[I.other_form] > THIRD:
+        read = read + 0.1 * p[I.current_gain_gain] * np.minimum(i, 1.0) + 0.2 * p[I.current_offset_bias] * np.tanh(i)
+    elif p[I.other_form]:
         t = np.arange(len(v)) * PERIOD
         read = read - 0.05 * p[I.current_gain_gain] * i * np.abs(i) + 0.1 * p[I.current_offset_bias] * np.sin(0.1 * t)
     read = read + p[I.outside_current_bend] * i * np.abs(i)

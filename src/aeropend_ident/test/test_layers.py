@@ -19,6 +19,7 @@ LAYERS = [
     ["diagnosis.search"],
     ["diagnosis.free_run_gap", "diagnosis.regions"],
     ["diagnosis.joint_fit", "diagnosis.validation", "diagnosis.experiment_design"],
+    ["diagnosis.strength"],
     ["diagnosis.conclude", "diagnosis.gap_share", "diagnosis.gap_budget"],
     ["diagnosis.since"],
     ["diagnosis.diagnosis"],

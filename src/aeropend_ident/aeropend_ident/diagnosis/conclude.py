@@ -23,15 +23,17 @@ from aeropend_ident.diagnosis.document import (
     ParameterRow,
 )
 from aeropend_ident.diagnosis.free_run_gap import HeldOut
-from aeropend_ident.diagnosis.joint_fit import JointFit
+from aeropend_ident.diagnosis.joint_fit import WIDER, JointFit
 from aeropend_ident.diagnosis.policy import CALIBRATED, MATERIAL_SHARE, angle_only
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis
 from aeropend_ident.diagnosis.search.onset import Onset
-from aeropend_ident.diagnosis.search.selection import FORM_SHOWS, mean_square, squared_gap
+from aeropend_ident.diagnosis.search.selection import FORM_SHOWS, mean_square, plausible, squared_gap
+from aeropend_ident.diagnosis.strength import Strengths
 from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.signals import Mounting, Signals
 from aeropend_ident.signals.statistics import Z95
+from aeropend_sim.model.effects import family
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import DUTY_MAP, MODEL_NAMES, OPTIONAL, Model
 
@@ -160,33 +162,52 @@ def candidates(joint: JointFit, statistical: Statistical, held_out: HeldOut, gap
         onset: when the effects found begin or end; None: they act all the time.
     """
     rows: dict[str, Candidate] = {}
+    strengths = Strengths(joint)
     for f in joint.findings.values():
-        accepted = {h.name for h in f.effects}
+        accepted = {h.family for h in f.effects}
         for k, selection in enumerate(f.selections):
-            winner = selection[0].hypothesis.name if k < len(f.found) else None
+            winner = selection[0].hypothesis.family if k < len(f.found) else None
             # what was found in its place, and after it, is no part of a rival's model
             off = {p.name: neutral(held_out.model, p.name) for s in f.found[k:] for p in s[0].hypothesis.own}
             for r in selection:
                 h = r.hypothesis
-                mine = h.name in accepted
-                if h.name in rows and (rows[h.name].probability >= r.probability or mine):
+                mine = h.family in accepted
+                if h.family in rows and (rows[h.family].probability >= r.probability or mine):
                     continue
                 if mine and r is not selection[0]:
                     continue
                 source, spread = (joint.values, joint.sd) if mine else (r.fit.values, r.fit.sd)
                 whole = {**joint.values, **off, **r.fit.values}
                 estimates = {key(p.name).name: interval(source[p.name], spread[p.name], p.low, p.high) for p in h.own}
+                strength = None
+                if mine:
+                    estimates = _over_forms(estimates, r, f.stage)
+                    strength = strengths.interval(r, f.stage, joint.checks[f.stage].form)
                 after = gap_after if mine else _finite(held_out.gap_of(whole).total)
                 since, until = (onset.since, onset.until) if onset and mine else (None, None)
-                rows[h.name] = Candidate(h.effect, h.place, r.probability, estimates, h.name in claimed, after,
-                                         share.get(h.name) if mine else None, since, until, _finite(r.gain),
-                                         None if mine else winner)
+                effect = family(h.effect)
+                rows[h.family] = Candidate(
+                    effect, h.place, r.probability, estimates, h.name in claimed, after,
+                    share.get(h.name) if mine else None, since, until, _finite(r.gain), None if mine else winner,
+                    "" if effect == h.effect else h.effect, r.forms, strength)
     for extra in statistical.found:
         h = extra.hypothesis
         estimates = {key(n).name: interval(v, extra.fit.sd[n], 0.0) for n, v in extra.fit.values.items()}
         rows[h.name] = Candidate(h.effect, h.place, extra.probability, estimates, h.name in claimed, gap_after,
                                  share.get(h.name))
     return tuple(sorted(rows.values(), key=lambda row: -row.probability))
+
+
+def _over_forms(estimates: Mapping[str, Interval], ranked: RankedHypothesis, stage: str) -> dict[str, Interval]:
+    """The estimates of an effect's parameters, their intervals over all its forms that explain the recording."""
+    wider = dict(estimates)
+    for r in plausible(ranked, stage):
+        for p in r.hypothesis.own:
+            name = key(p.name).name
+            if name in wider:
+                one, now = interval(r.fit.values[p.name], WIDER * r.fit.sd[p.name], p.low, p.high), wider[name]
+                wider[name] = replace(now, low=min(now.low, one.low), high=max(now.high, one.high))
+    return wider
 
 
 def not_separable(chains: CutChains, findings: Mapping[str, Findings]
@@ -228,7 +249,7 @@ def _closes_as_much(chains: CutChains, stage: str, before: Fit, first: RankedHyp
 def names(first: RankedHypothesis, second: RankedHypothesis) -> tuple[str, str]:
     """The names of two rivals: their effects; of two parameters that may be far off `parameter_mismatch:PARAMETER`."""
     a, b = first.hypothesis, second.hypothesis
-    return (a.effect, b.effect) if a.effect != b.effect else (a.name, b.name)
+    return (family(a.effect), family(b.effect)) if a.effect != b.effect else (a.name, b.name)
 
 
 def next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[RankedHypothesis, RankedHypothesis]],

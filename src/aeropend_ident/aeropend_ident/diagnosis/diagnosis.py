@@ -61,7 +61,7 @@ from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import CHANNELS, Signals
 from aeropend_ident.signals.statistics import rms
 from aeropend_sim.model import effect_file
-from aeropend_sim.model.effects import DEFINED
+from aeropend_sim.model.effects import DEFINED, family
 from aeropend_sim.model.parameters import Model
 from aeropend_sim.wording import times
 
@@ -451,7 +451,7 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
         channels={c: Channel(CHANNELS[c], gaps.before.rms[c], gaps.floors[c], gaps.after.rms[c], *gaps.fits(c))
                   for c in CHANNELS if all(c in g.rms for g in (gaps.before, gaps.after, gaps.fitted))},
         where=Where(head.place, regions.shares(places), tuple(regions.regions(found.misfit))),
-        which=Which(head.verdict, tuple(head.effects), candidates, rows,
+        which=Which(family(head.verdict), _families(head.effects), candidates, rows,
                     {channel: Residual(check.rms[channel], check.white[channel], check.dependence)
                      for check in joint.checks.values() for channel in check.rms},
                     tuple(reasons), None if unknown is None else _drawn(unknown.term, found.learned, joint, gaps,
@@ -459,13 +459,17 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
                     tuple(conclude.names(a, b) for a, b in undecided),
                     conclude.next_experiment(chains.model, found.recordings[0], undecided, joint.values, tried,
                                              settings.jobs),
-                    tuple(head.small)),
+                    _families(head.small)),
         closure=Closure(gaps.before.total, gaps.after.total, gaps.before.total_floor(gaps.floors), closed, low, high,
                         budget=gaps.budget(gust=found.statistical.gust is not None, jobs=settings.jobs)),
         identified=None if calibrated else conclude.identified_model(chains, joint, rows),
         since=None if chains.known is None else since.changes(
             chains.known, joint, found.statistical, head.claimed),
         estimates=None if failed else since.estimates(joint, found.statistical))
+
+
+def _families(ids: Sequence[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(family(id_) for id_ in ids))
 
 
 def _why_not_predicted(chains: CutChains, gaps: _Gaps) -> str:

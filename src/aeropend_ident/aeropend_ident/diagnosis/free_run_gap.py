@@ -53,15 +53,7 @@ def free_run(model: Model, signals: Signals, values: Mapping[str, float] | None 
     Returns:
         Channel -> (N,) readings before noise and quantisation.
     """
-    values = values or {}
-    omega = values.get("initial.omega", 0.0)
-    off = without_effects(values, model)
-    pieces = [(piece, with_values(model, values if acts else off)) for piece, acts in signals.acting()]
-    n = pieces[0][1].numbers()
-    state = dynamics.State(i_a=float(actuator.current_at(n, omega)), omega=omega,
-                           theta=values.get("initial.theta", 0.0), theta_dot=values.get("initial.theta_dot", 0.0),
-                           thrust=float(actuator.thrust(n, omega)))
-    run = _simulated(signals, pieces, state)
+    run, pieces = _run(model, signals, values or {})
     out = {"theta": np.empty(len(signals)), "omega": _held_speed(run, signals), "i_a": np.empty(len(signals)),
            "v_a": np.empty(len(signals))}
     for piece, m in pieces:
@@ -70,6 +62,24 @@ def free_run(model: Model, signals: Signals, values: Mapping[str, float] | None 
         out["i_a"][piece] = sensing.read_current(m, run.i_a[piece])
         out["v_a"][piece] = sensing.read_voltage(m, run.v_a[piece])
     return out
+
+
+def motion(model: Model, signals: Signals, values: Mapping[str, float]) -> tuple[dynamics.Trajectory, Model]:
+    """The states of a free run (see `free_run`), and the model with these values."""
+    return _run(model, signals, values)[0], with_values(model, values)
+
+
+def _run(model: Model, signals: Signals, values: Mapping[str, float]
+         ) -> tuple[dynamics.Trajectory, list[tuple[slice, Model]]]:
+    """The states of a free run, and the pieces of the recording with the model of each."""
+    omega = values.get("initial.omega", 0.0)
+    off = without_effects(values, model)
+    pieces = [(piece, with_values(model, values if acts else off)) for piece, acts in signals.acting()]
+    n = pieces[0][1].numbers()
+    state = dynamics.State(i_a=float(actuator.current_at(n, omega)), omega=omega,
+                           theta=values.get("initial.theta", 0.0), theta_dot=values.get("initial.theta_dot", 0.0),
+                           thrust=float(actuator.thrust(n, omega)))
+    return _simulated(signals, pieces, state), pieces
 
 
 def _simulated(signals: Signals, pieces: Sequence[tuple[slice, Model]], state: dynamics.State) -> dynamics.Trajectory:

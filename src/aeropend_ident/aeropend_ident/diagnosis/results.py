@@ -27,7 +27,7 @@ from aeropend_ident.diagnosis.document import (
 )
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.diagnosis.report import changes, page, sentence
-from aeropend_ident.diagnosis.report.candidates import open_pairs, unit_of
+from aeropend_ident.diagnosis.report.candidates import form_text, open_pairs, strength_text, unit_of
 from aeropend_ident.diagnosis.report.number_format import fit_text, plain, plain_percent, plain_time
 from aeropend_ident.diagnosis.report.parameters import lift_text
 from aeropend_ident.result_folder import atomic_folder, ensure_free
@@ -264,8 +264,9 @@ def experiment(advice: NextExperiment) -> str:
 
 def describe(candidate: Candidate) -> str:
     """A candidate's parameters with units and 95 % intervals, and its share of the gap."""
-    texts = [f"{name} = {plain(p.value)} ({plain(p.low)} to {plain(p.high)}) {unit_of(candidate.effect, name)}"
+    texts = [f"{name} = {plain(p.value)} ({plain(p.low)} to {plain(p.high)}) {unit_of(candidate.law, name)}"
              for name, p in candidate.parameters.items()]
     when = [f"; {word} at {plain_time(t.value)} s ({plain_time(t.low)} to {plain_time(t.high)} s)"
             for word, t in (("begins", candidate.since), ("ends", candidate.until)) if t]
-    return ", ".join(texts) + "".join(when) + (f"; {of_the_gap(candidate.share)}" if candidate.share else "")
+    more = [f"; {_spaced(text)}" for text in (form_text(candidate), strength_text(candidate)) if text]
+    return ", ".join(texts) + "".join([*more, *when]) + (f"; {of_the_gap(candidate.share)}" if candidate.share else "")

@@ -7,8 +7,10 @@ import math
 from dataclasses import dataclass
 
 from aeropend_ident.diagnosis.document import CANNOT_TELL, Candidate, DiagnosisDocument, Interval, NextExperiment
+from aeropend_ident.diagnosis.policy import CALIBRATED
 from aeropend_ident.diagnosis.report.number_format import interval, minus, percent, probability, with_unit
 from aeropend_ident.diagnosis.report.sentence import NONE, SAME_END
+from aeropend_sim.model.effect_file import unit_of as unit_of_term
 from aeropend_sim.model.effects import DEFINED, PARAMETER_MISMATCH
 from aeropend_sim.model.parameters import PARAMETERS
 
@@ -183,12 +185,31 @@ def _row(document: DiagnosisDocument, c: Candidate) -> CandidateRow:
     estimates = []
     for name, q in c.parameters.items():
         value, between = interval(q.value, q.low, q.high)
-        estimates.append(Estimate(name, with_unit(value, unit_of(c.effect, name)), between))
+        estimates.append(Estimate(name, with_unit(value, unit_of(c.law, name)), between))
     physics = minus(f"{PARAMETERS[f'model.{parameter}'].description}; its value is off" if parameter
-                    else DEFINED[c.effect].physics)
+                    else DEFINED[c.law].physics)
+    physics += "".join(f"; {text}" for text in (form_text(c), strength_text(c)) if text)
     return CandidateRow(c.effect, parameter, c.place, physics, c.probability, estimates, c.gap_after,
                         _closes(document, c), c.found, share_text(c.share) if c.share else "", why_lost(document, c),
                         _when(c))
+
+
+def form_text(c: Candidate) -> str:
+    """The form of an effect: `form: ground_effect_rational`, or those that the recording cannot separate."""
+    likely = {form: p for form, p in c.forms.items() if p > CALIBRATED.undecided}
+    names = [f"{form} {percent(p)}" for form, p in likely.items()]
+    if len(likely) > 1:
+        return f"form not separable: {', '.join(names)}"
+    return f"form: {c.law}" if c.form else ""
+
+
+def strength_text(c: Candidate) -> str:
+    """The strength of an effect: `its term has 0.81 rad/s² RMS (0.79 to 0.83)`."""
+    if c.strength is None:
+        return ""
+    effect = DEFINED[c.law]
+    value, between = interval(c.strength.value, c.strength.low, c.strength.high)
+    return f"its term has {with_unit(value, unit_of_term(effect.place, effect.reading))} RMS ({between})"
 
 
 def _closes(document: DiagnosisDocument, c: Candidate) -> str:
@@ -204,7 +225,7 @@ def _at_an_end(c: Candidate) -> list[str]:
     """The parameters of an effect that are at an end of their range, apart from the value without the effect."""
     if c.effect == PARAMETER_MISMATCH:
         return []
-    known = DEFINED[c.effect].parameters
+    known = DEFINED[c.law].parameters
     return [name for name, q in c.parameters.items() for end in (known[name].low, known[name].high)
             if end != known[name].neutral and abs(q.value - end) <= AT_END * abs(end)]
 

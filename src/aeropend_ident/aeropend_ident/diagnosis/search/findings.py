@@ -19,13 +19,21 @@ class RankedHypothesis:
         hypothesis: what was fitted.
         fit: of the hypothesis on top of what was found before.
         gain: log evidence over no further effect, prior odds included.
-        probability: among the hypotheses of its selection round.
+        probability: among the hypotheses of its selection round; of all forms of its effect.
+        others: the other forms of its effect that were fitted, each with its probability among all of them.
     """
 
     hypothesis: Hypothesis
     fit: Fit
     gain: float
     probability: float
+    others: tuple[RankedHypothesis, ...] = ()
+
+    @property
+    def forms(self) -> dict[str, float]:
+        """Form of its effect -> probability among them, the best first; empty if only one was fitted."""
+        first = {self.hypothesis.effect: 1.0 - sum(r.probability for r in self.others)}
+        return {**first, **{r.hypothesis.effect: r.probability for r in self.others}} if self.others else {}
 
 
 Selection = tuple[RankedHypothesis, ...]

@@ -24,6 +24,7 @@ from aeropend_ident.diagnosis.chain.values import FEWEST_PARAMETERS, PLACE_OF_PA
 from aeropend_ident.diagnosis.policy import angle_only
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_sim.model.effects import CATALOGUE, DEFINED, PARAMETER_MISMATCH, RANDOM, EffectParameter
+from aeropend_sim.model.forms import FORMS
 from aeropend_sim.model.parameters import Model
 
 MISMATCH_SD = 0.3
@@ -98,9 +99,17 @@ class Hypothesis:
         return self.starts[0]
 
     @property
+    def family(self) -> str:
+        """The effect of which it is a form, or its own; see `name` for a parameter."""
+        return self.name if self.parameter else DEFINED[self.effect].family
+
+    @property
     def log_odds(self) -> float:
-        """Prior log odds against no further effect."""
-        return math.log(EFFECT_ODDS / (FEWEST_PARAMETERS if self.parameter else 1))
+        """Prior log odds against no further effect; the other forms of an effect are as likely as the first."""
+        if self.parameter:
+            return math.log(EFFECT_ODDS / FEWEST_PARAMETERS)
+        of = DEFINED[self.effect].form_of
+        return math.log(EFFECT_ODDS / max(sum(form.form_of == of for form in FORMS.values()) if of else 1, 1))
 
 
 def hypotheses(model: Model, further: Sequence[str] = (), left_out: Sequence[str] = (), *, mismatches: bool = True,
@@ -114,8 +123,9 @@ def hypotheses(model: Model, further: Sequence[str] = (), left_out: Sequence[str
         mismatches: whether each parameter of the model may be far off, too.
         known: what earlier verdicts know; parameters and effects that they have determined may have changed.
     """
+    there = {DEFINED[id_].family for id_ in model.effects if id_ in DEFINED}
     all_ = [Hypothesis(id_, starts=tuple(_starts(id_, model))) for id_ in (*CATALOGUE, *further)
-            if id_ not in model.effects and id_ not in left_out]
+            if DEFINED[id_].family not in there and id_ not in left_out and not DEFINED[id_].form_of]
     if known is not None:
         return [*all_, *_changes(model, known)]
     if not mismatches:
@@ -126,6 +136,37 @@ def hypotheses(model: Model, further: Sequence[str] = (), left_out: Sequence[str
             if nominal != 0.0:
                 all_.append(Hypothesis(PARAMETER_MISMATCH, name, ((_far_off(name, nominal),),)))
     return all_
+
+
+def other_forms(h: Hypothesis, chains: CutChains) -> list[Hypothesis]:
+    """The other forms of an effect, of effect files too, each with its own parameters at their defaults."""
+    model = chains.model
+    if h.parameter or h.effect in model.effects:
+        return []
+    forms = []
+    for effect in (DEFINED[id_] for id_ in (*FORMS, *chains.further)):
+        if effect.form_of != h.effect or effect.id in chains.left_out:
+            continue
+        own = [_somewhere(f"{effect.id}.{name}", p, math.nan) for name, p in effect.parameters.items() if not p.refines]
+        size = effect.parameters[effect.size]
+        step = usual_size(effect.id, model) - size.neutral
+        forms.append(Hypothesis(effect.id, starts=((
+            Parameter(own[0].name, size.neutral, SIZE_SD * abs(step), size.low, size.high,
+                      start=size.neutral + FIRST_SIZE * step), *own[1:]),)))
+    return forms
+
+
+def as_form(h: Hypothesis, form: Hypothesis, values: Mapping[str, float]) -> dict[str, float]:
+    """Values with those of an effect handed to a form of it; what only the form has starts at its default.
+
+    Args:
+        h: the effect.
+        form: another form of it.
+        values: of a fit with the effect.
+    """
+    own = {key(p.name).name: values[p.name] for p in h.own}
+    return {**{n: v for n, v in values.items() if n not in {p.name for p in h.own}},
+            **{p.name: min(max(own[key(p.name).name], p.low), p.high) for p in form.own if key(p.name).name in own}}
 
 
 def _far_off(name: str, nominal: float) -> Parameter:

@@ -18,6 +18,7 @@ from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis,
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import (
     Hypothesis,
+    as_form,
     as_identified,
     delay_from_voltage,
     hypotheses,
@@ -30,8 +31,11 @@ from aeropend_ident.diagnosis.search.selection import (
     FORM_SHOWS,
     ROUNDS,
     SelectionRound,
+    better,
+    frugal,
     log_evidence_over,
     mean_square,
+    shared,
     squared_gap,
 )
 from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess
@@ -95,17 +99,17 @@ def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], No
     calibrated, known = chains.policy.calibrated, chains.known
     all_ = hypotheses(chains.model, chains.further, chains.left_out, mismatches=calibrated, known=known)
     everything = [as_identified(chains, h) for h in all_ if not is_decided(chains, h)]
-    acts_on = {h.name: stages_of(chains, h) for h in everything}
+    acts_on = {h.family: stages_of(chains, h) for h in everything}
     carried: dict[str, Parameter] = {}
     with ThreadPoolExecutor(jobs) as pool:
         for done, stage in enumerate(STAGES):
             progress(stage, done / len(STAGES))
-            mine = [h for h in everything if acts_on[h.name][:1] == (stage,)]
+            mine = [h for h in everything if acts_on[h.family][:1] == (stage,)]
             f = _search_stage(chains, stage, mine, acts_on, list(carried.values()), trifle, pool, deadline)
             findings[stage] = f
             # an effect that acts on later stages too goes along, with the uncertainty that it has here
             for h in f.effects:
-                if len(acts_on[h.name]) > 1:
+                if len(acts_on[h.family]) > 1:
                     for p in h.own:
                         carried[p.name] = Parameter(p.name, f.final.values[p.name], max(f.final.sd[p.name], 1e-12),
                                                     p.low, p.high)
@@ -142,7 +146,7 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
     if not base.residuals:
         return findings
     candidates = [delay_from_voltage(chains, h, base.values) for h in candidates]
-    others = {b for h in candidates for b in acts_on[h.name] if b != stage}
+    others = {b for h in candidates for b in acts_on[h.family] if b != stage}
     downstream = {b: fit(chains.residuals(b), nominal_parameters(chains, b), least_ess=chains.policy.least_ess)
                   for b in others}
     known, supported, gained = nominal, findings, 0.0
@@ -162,14 +166,15 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
     if len(findings.found) > len(supported.found):
         rivals = findings.found[len(supported.found)]
         findings = replace(supported, rivals=rivals, cut_short=findings.cut_short)
-    return _without_unneeded(chains, _with_better_rivals(chains, findings, nominal), nominal)
+    findings = _with_best_forms(chains, _with_better_rivals(chains, findings, nominal), nominal)
+    return _without_unneeded(chains, findings, nominal)
 
 
 def _select(here: SelectionRound, findings: Findings, candidates: list[Hypothesis]
             ) -> tuple[Findings, Hypothesis | None]:
     """One selection round: screen, fit, rank, accept; returns the effect that was accepted, if any."""
     chains, policy = here.chains, here.chains.policy
-    open_ = [h for h in candidates if h.name not in {g.name for g in findings.effects}]
+    open_ = [h for h in candidates if h.family not in {g.family for g in findings.effects}]
     tried, lead = here.screened(open_), None
     if not tried:
         return findings, None
@@ -180,6 +185,8 @@ def _select(here: SelectionRound, findings: Findings, candidates: list[Hypothesi
     tried = here.converged(tried, rounds, but=lead)
     if not policy.wide_search and not any(passes_as_noise(f, MATERIAL) for _, f in tried):
         tried = here.multi_started(tried)
+    if policy.driven and not policy.wide_search:
+        tried = here.with_forms(tried)
     if not findings.found:
         tried = here.from_plain(open_, tried)
     ranked = here.ranked(tried)
@@ -234,9 +241,9 @@ def _with_better_rivals(chains: CutChains, findings: Findings, nominal: list[Par
 
 def _rivals(findings: Findings, k: int) -> list[RankedHypothesis]:
     """The close rivals of an effect found: those with evidence, but all of an effect that alone had none."""
-    selection, taken = findings.found[k], {h.name for h in findings.effects}
+    selection, taken = findings.found[k], {h.family for h in findings.effects}
     return [r for r in selection[1:CONTENDERS]
-            if (r.gain > 0.0 or selection[0].gain <= 0.0) and r.hypothesis.name not in taken]
+            if (r.gain > 0.0 or selection[0].gain <= 0.0) and r.hypothesis.family not in taken]
 
 
 def _swapped(chains: CutChains, findings: Findings, nominal: list[Parameter], k: int, rival: RankedHypothesis
@@ -254,6 +261,40 @@ def _swapped(chains: CutChains, findings: Findings, nominal: list[Parameter], k:
     others = [replace(r, probability=1.0 - sure if r is selection[0] else 0.0) for r in selection if r is not rival]
     swapped = (replace(rival, fit=f, gain=rival.gain + gain, probability=sure), *others)
     return replace(findings, found=(*findings.found[:k], swapped, *findings.found[k + 1:]), final=f)
+
+
+def _with_best_forms(chains: CutChains, findings: Findings, nominal: list[Parameter]) -> Findings:
+    """Choose the form of each effect again beside the others: alone, it may have stood in for one of them."""
+    if len(findings.found) < 2:
+        return findings
+    for k, (first, *rivals) in enumerate(findings.found):
+        if first.others:
+            best, *others = _forms_beside(chains, findings, _beside(findings, nominal, first.hypothesis), first)
+            found = (replace(best, others=shared(best, others)), *rivals)
+            findings = replace(findings, found=(*findings.found[:k], found, *findings.found[k + 1:]), final=best.fit)
+    return findings
+
+
+def _forms_beside(chains: CutChains, findings: Findings, beside: list[Parameter], first: RankedHypothesis
+                  ) -> list[RankedHypothesis]:
+    """The forms of an effect that was found, each fitted beside the other effects; the best first."""
+    def fitted(h: Hypothesis, begun: Mapping[str, float]) -> Fit:
+        return fit(chains.residuals(findings.stage), started(adopted(beside, h), begun))
+
+    now = findings.final.values
+    tried = [(first.hypothesis, findings.final)]
+    tried += [(r.hypothesis, fitted(r.hypothesis, {**now, **{p.name: r.fit.values[p.name] for p in r.hypothesis.own}}))
+              for r in first.others]
+    lead, led = max(tried, key=lambda one: one[1].log_likelihood)
+    again = [f if h is lead or len(h.own) > len(lead.own) else fitted(h, as_form(lead, h, led.values))
+             for h, f in tried]  # a form with fewer parameters may serve as well with those of the likeliest
+    tried = better(tried, again)
+    ess = largest_ess([f for _, f in tried])
+    gains = [f.log_evidence(ess) - findings.final.log_evidence(ess) + h.log_odds - first.hypothesis.log_odds
+             for h, f in tried]
+    gains = frugal(chains, findings.stage, tried, gains)
+    ranked = [RankedHypothesis(h, f, first.gain + g, first.probability) for (h, f), g in zip(tried, gains, strict=True)]
+    return sorted(ranked, key=lambda r: -r.gain)
 
 
 def _alike(chains: CutChains, findings: Findings, f: Fit) -> bool:

@@ -4,14 +4,15 @@
 The order, as `search` calls it: `screened` (linear algebra leaves a shortlist, which is fitted for some rounds),
 `warm_started` (uncalibrated rigs: the best is fitted to its end, the others start again from its parameters),
 `converged` (the contenders are fitted to their end), `multi_started` (from their other start points),
-`from_plain` (driven rigs with the angle alone: from the nominal model without its further terms), `ranked`.
+`with_forms` (other forms of the contenders are fitted too), `from_plain` (driven rigs with the angle alone: from the
+nominal model without its further terms), `ranked`.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -20,10 +21,16 @@ import numpy as np
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import absent, nominal_parameters, nominal_sd
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, neutral
-from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
+from aeropend_ident.diagnosis.policy import CALIBRATED, MATERIAL_SHARE
 from aeropend_ident.diagnosis.search.findings import RankedHypothesis, Selection, adopted
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
-from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, from_linear, linear_parameters
+from aeropend_ident.diagnosis.search.hypotheses import (
+    Hypothesis,
+    as_form,
+    from_linear,
+    linear_parameters,
+    other_forms,
+)
 from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess, screen
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.signals import CHANNELS
@@ -185,6 +192,22 @@ class SelectionRound:
         work = [self._submit(h, ROUNDS, begun=b.values) if b else None for (h, _), b in zip(tried, best, strict=True)]
         return better(tried, [w.result() if w else f for (_, f), w in zip(tried, work, strict=True)])
 
+    def with_forms(self, tried: FittedHypotheses) -> FittedHypotheses:
+        """The hypotheses, and other forms of the contenders; of the likeliest alone if it explains all."""
+        likeliest = self._likeliest(tried)[:CONTENDERS]
+        if mean_square(likeliest[0][2], self.stage) < FORM_SHOWS:
+            likeliest = likeliest[:1]
+        work = [[(form, self._submit(form, ROUNDS, begun=as_form(h, form, f.values)))
+                 for form in other_forms(h, self.chains)] for _, h, f in likeliest]
+        again: dict[str, Fit] = {}
+        for (_, h, f), forms in zip(likeliest, work, strict=True):
+            done = [(form, w.result()) for form, w in forms]
+            tried = tried + done
+            form, best = max(done, key=lambda one: one[1].log_likelihood, default=(h, f))
+            if best.log_likelihood > f.log_likelihood:  # the effect itself may serve as well with these parameters
+                again[h.name] = self._submit(h, ROUNDS, begun=as_form(form, h, best.values)).result()
+        return better(tried, [again.get(h.name, f) for h, f in tried])
+
     def from_plain(self, candidates: list[Hypothesis], tried: FittedHypotheses) -> FittedHypotheses:
         """Fit from the nominal model without its further terms, if nothing tried explains all.
 
@@ -214,7 +237,7 @@ class SelectionRound:
         """
         gains = [x + h.log_odds for (h, _), x in zip(tried, self._gains(tried, Fit.log_evidence), strict=True)]
         first = self._close_most(tried)
-        by_evidence, gains = gains, self._frugal(tried, gains)
+        by_evidence, gains = gains, frugal(self.chains, self.stage, tried, gains)
         behind = {h.name for (h, _), g, now, closes in zip(tried, by_evidence, gains, first, strict=True)
                   if now < g or not closes}
         weights = np.where([*first, none], [*gains, 0.0], -np.inf)
@@ -222,7 +245,7 @@ class SelectionRound:
         probability = weights / weights.sum()
         ranked = [RankedHypothesis(h, f, g, float(p)) for (h, f), g, p in zip(tried, gains, probability, strict=False)]
         order = sorted(range(len(tried)), key=lambda j: (not first[j], -gains[j]))
-        return tuple(self._ranked_by_place([ranked[j] for j in order], behind))
+        return tuple(self._ranked_by_place(by_family([ranked[j] for j in order]), behind))
 
     def _close_most(self, tried: FittedHypotheses) -> list[bool]:
         """Whether no other hypothesis leaves a materially smaller gap in this stage: evidence decides only among these.
@@ -232,19 +255,6 @@ class SelectionRound:
         left = [self.left_open(f) for _, f in tried]
         most = min(left, default=0.0) + MATERIAL_SHARE * self.left_open(self.current)
         return [x <= most for x in left]
-
-    def _frugal(self, tried: FittedHypotheses, gains: list[float]) -> list[float]:
-        """The gains, where of alike hypotheses that with fewer parameters is the likelier one.
-
-        If no hypothesis explains all, other imperfections are left. A further parameter then describes some of them: it
-        has much more evidence, but closes hardly more of the gap.
-        """
-        left = [self.left_open(f) for _, f in tried]
-        if min((mean_square(f, self.stage) for _, f in tried), default=0.0) < FORM_SHOWS:
-            return gains
-        alike = [j for j, x in enumerate(left) if x <= ALIKE * min(left)]
-        simpler = {j: [gains[i] - FEWER for i in alike if len(tried[i][0].own) < len(tried[j][0].own)] for j in alike}
-        return [min(g, *simpler[j]) if simpler.get(j) else g for j, g in enumerate(gains)]
 
     def left_open(self, f: Fit) -> float:
         """What a fit leaves of the squared gap in this stage."""
@@ -269,7 +279,7 @@ class SelectionRound:
         ess = largest_ess([self.current, *self.downstream.values(), *(f for _, f in tried)])
         later = {b: of(f, ess) for b, f in self.downstream.items()}
         return [of(f, ess) - of(self.current, ess)
-                - sum(later[b] for b in self.acts_on[h.name] if b != self.stage) for h, f in tried]
+                - sum(later[b] for b in self.acts_on[h.family] if b != self.stage) for h, f in tried]
 
     def _ranked_by_place(self, ranked: list[RankedHypothesis], behind: Collection[str]) -> list[RankedHypothesis]:
         """Decide between close rivals at different places if none of them explains the whole misfit.
@@ -309,7 +319,7 @@ class SelectionRound:
         """Fit a hypothesis on top of what is known, on every stage that it changes; go on from `begun` if given."""
         functions = [self.chains.residuals(self.stage)]
         known = started(self.known, self.current.values)
-        for other in self.acts_on[hypothesis.name]:
+        for other in self.acts_on[hypothesis.family]:
             if other != self.stage:
                 functions.append(self.chains.residuals(other))
                 known += started(nominal_parameters(self.chains, other), self.downstream[other].values)
@@ -344,6 +354,52 @@ class SelectionRound:
         if inside:
             own[second] = min(max(own[second], reach * bounds.low), reach * bounds.high)
         return own
+
+
+def frugal(chains: CutChains, stage: str, tried: FittedHypotheses, gains: list[float]) -> list[float]:
+    """The gains, where of alike hypotheses that with fewer parameters is the likelier one.
+
+    If no hypothesis explains all, other imperfections are left. A further parameter then describes some of them: it has
+    much more evidence, but closes hardly more of the gap.
+    """
+    left = [squared_gap(chains, f, CHANNELS_OF[stage]) for _, f in tried]
+    if min((mean_square(f, stage) for _, f in tried), default=0.0) < FORM_SHOWS:
+        return gains
+    alike = [j for j, x in enumerate(left) if x <= ALIKE * min(left)]
+    simpler = {j: [gains[i] - FEWER for i in alike if len(tried[i][0].own) < len(tried[j][0].own)] for j in alike}
+    return [min(g, *simpler[j]) if simpler.get(j) else g for j, g in enumerate(gains)]
+
+
+def by_family(ranked: list[RankedHypothesis]) -> list[RankedHypothesis]:
+    """Of each effect the best of its forms, with the probability of all of them and how it is shared among them.
+
+    Args:
+        ranked: the best first.
+    """
+    forms: dict[str, list[RankedHypothesis]] = {}
+    for r in ranked:
+        forms.setdefault(r.hypothesis.family, []).append(r)
+    found = []
+    for first, *others in forms.values():
+        if not others:
+            found.append(first)
+            continue
+        total = sum(r.probability for r in (first, *others))
+        found.append(replace(first, probability=total, others=shared(first, others)))
+    return found
+
+
+def shared(first: RankedHypothesis, others: Sequence[RankedHypothesis]) -> tuple[RankedHypothesis, ...]:
+    """The other forms of an effect, each with its probability among all of them, the first included."""
+    weights = np.exp([r.gain - first.gain for r in (first, *others)])
+    return tuple(replace(r, probability=float(p)) for r, p in zip(others, weights[1:] / weights.sum(), strict=True))
+
+
+def plausible(ranked: RankedHypothesis, stage: str) -> list[RankedHypothesis]:
+    """The other forms of an effect that explain a recording: by probability, or, if none fits, as much as the best."""
+    if mean_square(ranked.fit, stage) < FORM_SHOWS:
+        return [r for r in ranked.others if r.probability > CALIBRATED.undecided]
+    return [r for r in ranked.others if mean_square(r.fit, stage) <= ALIKE * mean_square(ranked.fit, stage)]
 
 
 def better(tried: FittedHypotheses, again: list[Fit]) -> FittedHypotheses:
