@@ -105,7 +105,7 @@ class Policy:
 
 CALIBRATED = Policy(
     "calibrated rig", calibrated=True, driven=True, screening_rounds=2, steps=4, least_ess=100.0, budget=None,
-    noise_margin=MATERIAL, undecided=0.05, unknown=UnknownLimits(0.12, 0.025, 0.01, 0.25, 0.2, NOTICEABLE))
+    noise_margin=MATERIAL, undecided=0.05, unknown=UnknownLimits(0.12, 0.025, 0.01, 0.25, MATERIAL_SHARE, NOTICEABLE))
 """Limits for an unknown effect (measured: simulated rigs whose effects have another form than the catalogue's).
 
 ±30 % of `noticeable` changes up to 4 of 20 verdicts, and one screening round instead of two changes 1 of 18. The other

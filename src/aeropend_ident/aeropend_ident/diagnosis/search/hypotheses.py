@@ -46,6 +46,9 @@ FIRST_SIZE = 0.3
 
 Measured: at ±30 % no verdict of 25 recordings changes (docs/results/thresholds.md)."""
 
+SIZES = (0.3, 1.0, 3.0)
+"""Sizes, in default sizes, from which the search of a form starts whose size is no parameter of its effect (choice)."""
+
 SMALLER = 0.1
 """Second size, over the first, from which the search for dry friction starts.
 
@@ -150,9 +153,11 @@ def other_forms(h: Hypothesis, chains: CutChains) -> list[Hypothesis]:
         own = [_somewhere(f"{effect.id}.{name}", p, math.nan) for name, p in effect.parameters.items() if not p.refines]
         size = effect.parameters[effect.size]
         step = usual_size(effect.id, model) - size.neutral
-        forms.append(Hypothesis(effect.id, starts=((
-            Parameter(own[0].name, size.neutral, SIZE_SD * abs(step), size.low, size.high,
-                      start=size.neutral + FIRST_SIZE * step), *own[1:]),)))
+        head = Parameter(own[0].name, size.neutral, SIZE_SD * abs(step), size.low, size.high)
+        # a size that the effect itself does not have is not known from it
+        sizes = (FIRST_SIZE,) if key(head.name).name in {key(p.name).name for p in h.own} else SIZES
+        forms.append(Hypothesis(effect.id, starts=tuple(
+            (replace(head, start=size.neutral + share * step), *own[1:]) for share in sizes)))
     return forms
 
 

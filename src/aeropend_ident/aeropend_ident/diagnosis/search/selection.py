@@ -197,11 +197,11 @@ class SelectionRound:
         likeliest = self._likeliest(tried)[:CONTENDERS]
         if mean_square(likeliest[0][2], self.stage) < FORM_SHOWS:
             likeliest = likeliest[:1]
-        work = [[(form, self._submit(form, ROUNDS, begun=as_form(h, form, f.values)))
-                 for form in other_forms(h, self.chains)] for _, h, f in likeliest]
+        work = [[(form, [self._submit(replace(form, starts=(start,)), ROUNDS, begun=as_form(h, form, f.values))
+                         for start in form.starts]) for form in other_forms(h, self.chains)] for _, h, f in likeliest]
         again: dict[str, Fit] = {}
         for (_, h, f), forms in zip(likeliest, work, strict=True):
-            done = [(form, w.result()) for form, w in forms]
+            done = [(form, max((w.result() for w in each), key=lambda fit: fit.log_likelihood)) for form, each in forms]
             tried = tried + done
             form, best = max(done, key=lambda one: one[1].log_likelihood, default=(h, f))
             if best.log_likelihood > f.log_likelihood:  # the effect itself may serve as well with these parameters
@@ -390,8 +390,11 @@ def by_family(ranked: list[RankedHypothesis]) -> list[RankedHypothesis]:
 
 
 def shared(first: RankedHypothesis, others: Sequence[RankedHypothesis]) -> tuple[RankedHypothesis, ...]:
-    """The other forms of an effect, each with its probability among all of them, the first included."""
-    weights = np.exp([r.gain - first.gain for r in (first, *others)])
+    """The other forms of an effect, each with its probability among all of them, the first included.
+
+    One with more log evidence that closes less of the gap counts as much as the first at most.
+    """
+    weights = np.exp([min(r.gain - first.gain, 0.0) for r in (first, *others)])
     return tuple(replace(r, probability=float(p)) for r, p in zip(others, weights[1:] / weights.sum(), strict=True))
 
 
