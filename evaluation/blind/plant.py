@@ -50,6 +50,9 @@ OUTSIDE = {
 }
 """Effects that the catalogue does not know: place, and a size to start from."""
 
+HELD = {"slew_limit": "command_delay", "soft_stop": "cable_torque"}
+"""Those of `OUTSIDE` that another form of an effect holds: a ramp of the voltage, a spring with slack."""
+
 PARAMETERS = (*NUMBERS, "filter_tau", *(f"{e}_{q}" for e, qs in EFFECTS.items() for q in qs),
               *(f"outside_{name}" for name in OUTSIDE), "other_form")
 Index = namedtuple("Index", PARAMETERS)  # type: ignore[misc]

@@ -18,6 +18,7 @@ from scipy import stats
 
 from aeropend_ident.diagnosis.document import from_json
 from aeropend_sim.model.effects import CATALOGUE, PARAMETER_MISMATCH
+from evaluation.blind.plant import HELD
 
 KINDS = ("single", "none", "two", "outside")
 FAILED = "failed"
@@ -314,6 +315,7 @@ def worst_effect(pairs: Pairs) -> Figure:
 def scored(pairs: Pairs) -> list[Figure]:
     """The figures that peers can be scored by as well."""
     single, none, two, out = (of_kind(pairs, kind) for kind in KINDS)
+    out = [(t, a) for t, a in out if t.effects[0].key not in HELD]
     return [
         share("right effect first", [right_first(t, a) for t, a in single], at_least=0.90),
         worst_effect(pairs),
@@ -353,6 +355,8 @@ def figures(pairs: Pairs) -> list[Figure]:
         share("95 % intervals that hold the truth, another form", intervals_held(pairs, "other")),
         *besides(pairs),
         share("none: `unknown`", [a.first == "unknown" for _, a in none]),
+        share("outside, but held by another form of an effect: that effect first",
+              [a.first == HELD[t.effects[0].key] for t, a in out if t.effects[0].key in HELD]),
         share("first of two right", [right_first(t, a) for t, a in two]),
         share("outside: right place where `unknown`", [right_place(t, a) for t, a in out if a.first == "unknown"]),
     ]
