@@ -101,6 +101,14 @@ def test_a_mass_on_the_arm_is_named(monday):
     assert any("a mass put on the arm" in line for line in changes.lines(found))
 
 
+def test_a_verdict_that_leaves_parameters_undetermined_can_be_compared_with(tmp_path):
+    bags.write(tmp_path / "bag", columns_of(drawn_rig(3, {}), 3, 8.0), round(SAMPLE_PERIOD * 1e9))
+    assert command.main([str(tmp_path / "bag"), "--uncalibrated", "--out", str(tmp_path / "monday")]) == 0
+    _, known, (verdict,) = since.read([tmp_path / "monday"])
+    assert "k2" in verdict.identified.not_determined
+    assert (known.covariance == known.covariance.T).all()
+
+
 def test_a_product_is_known_although_its_factors_are_not(monday):
     _, known, _ = since.read([monday])
     at = [known.names.index(n) for n in ("k_thrust", "L_over_J")]

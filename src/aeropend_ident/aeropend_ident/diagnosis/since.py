@@ -105,6 +105,7 @@ def estimates(joint: JointFit, statistical: Statistical) -> Estimates:
             own[j, j] += max(float(np.var(runs, ddof=1)) - own[j, j], 0.0)
     random = {n: (v, s.fit.sd[n]) for s in statistical.found for n, v in s.fit.values.items()}
     own = block_diag(own, np.diag([sd**2 for _, sd in random.values()]))
+    own = 0.5 * (own + own.T)  # the inverse of an ill-conditioned matrix is symmetric only to a few digits
     return Estimates((*plain, *random), (*(mean @ values).tolist(), *(v for v, _ in random.values())),
                      tuple(tuple(row) for row in own.tolist()))
 
