@@ -7,8 +7,9 @@ import pytest
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.results import Results, document
+from aeropend_ident.diagnosis.search.formula_fit import _proposals
 from aeropend_ident.diagnosis.search.hypotheses import hypotheses
-from aeropend_ident.diagnosis.search.learned_term import FORMS, Curve, definition
+from aeropend_ident.diagnosis.search.learned_term import FORMS, Curve, Learned, defined, definition
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, recorded, steps
 from aeropend_sim.model import effect_file
 from aeropend_sim.model.effects import CATALOGUE, DEFINED
@@ -103,6 +104,20 @@ def test_every_form_makes_an_effect_whose_units_are_right():
             curves = [Curve(f, np.linspace(-1.0, 1.0, 14), letter) for f, letter in zip(chosen, "abc", strict=False)]
             effect_file.define({"any_learned": definition(curves)}, "a test")
             effect_file.forget("any_learned")
+
+
+def test_formulas_are_proposed_for_two_curves_over_one_quantity():
+    chains = CutChains(BENCH, [recorded(104, {}, duration=10.0)])
+    knot = np.linspace(0.0, 400.0, 14)
+    forms = [f for f in FORMS["motor"] if (f.place, f.of) == ("electrical", "omega")]
+    curves = tuple(Curve(f, knot, letter) for f, letter in zip(forms, "ab", strict=True))
+    learned = Learned(defined(curves), "electrical", curves, None, None)
+    size = {"a": 2e-3, "b": 1e-3}
+    values = {f"{learned.id}.{name}": size[c.letter] * x for c in curves for name, x in
+              zip(c.names, knot)}
+    values[f"{learned.id}.gain"] = 1.0
+    terms = [str(tree["term"]) for tree in _proposals(chains, learned, values, dict.fromkeys(values, 1e-3))]
+    assert any("i_a" in term and "omega" in term for term in terms)
 
 
 def test_the_catalogue_is_never_forgotten():

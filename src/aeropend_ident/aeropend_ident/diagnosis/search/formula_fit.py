@@ -79,6 +79,7 @@ def _proposals(chains: CutChains, learned: Learned, values: Mapping[str, float],
                ) -> list[dict[str, object]]:
     """Definitions of formulas that are like the learned curves."""
     forms = [c.form for c in learned.curves]
+    quantities = {_name(f.of): f for f in forms}  # two curves may be of one: itself, and times a factor
     names = dict.fromkeys(n for f in forms for n in (_name(f.of), f.factor) if n)
     units = {n: QUANTITIES[n] if n in QUANTITIES else next(f.unit for f in forms if _name(f.of) == n) for n in names}
     variables: dict[str, list[Array]] = {n: [] for n in names}
@@ -88,15 +89,15 @@ def _proposals(chains: CutChains, learned: Learned, values: Mapping[str, float],
         own = chains.values_of(values, k)
         use = slice(0, chain.signals.train, THIN)
         tau = own.get(f"{learned.id}.tau", 1.0)
-        for c in learned.curves:
-            variables[_name(c.form.of)].append(quantity(chain, replace(c.form, tau=tau), own)[use])
-        for factor in {c.form.factor for c in learned.curves if c.form.factor} - {_name(f.of) for f in forms}:
+        for n, form in quantities.items():
+            variables[n].append(quantity(chain, replace(form, tau=tau), own)[use])
+        for factor in {f.factor for f in forms if f.factor} - quantities.keys():
             variables[factor].append(quantity(chain, replace(forms[0], of=factor, rate=""), own)[use])
         parts = [_along(c, learned, variables, own, sd) for c in learned.curves]
         target.append(sum((part for part, _ in parts), np.zeros(len(parts[0][0]))))
         unsure.append(np.sqrt(sum((s**2 for _, s in parts), np.zeros(len(parts[0][0])))))
     joined = {n: np.concatenate(x) for n, x in variables.items()}
-    knots = {_name(c.form.of): c.knot for c in learned.curves}
+    knots = {n: np.concatenate([c.knot for c in learned.curves if _name(c.form.of) == n]) for n in quantities}
     place, reading = forms[0].place, forms[0].reading
     unit = effect_file.unit_of(place, reading)
     found = propose(joined, units, np.concatenate(target), np.concatenate(unsure), unit, knots=knots)
