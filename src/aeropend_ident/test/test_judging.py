@@ -155,3 +155,24 @@ def test_receive_times_that_tell_nothing_change_no_stamp(bags, tmp_path):
     for number, received in enumerate((np.zeros(N), STAMPS[0] + rng.integers(0, 10**12, N))):
         (tmp_path / f"{number}").mkdir()
         assert read(written(bags, tmp_path / f"{number}", received=received)).stamp_ns.tolist() == STAMPS.tolist()
+
+
+def test_a_signalling_nan_is_a_plain_one(bags, tmp_path):
+    joint, motor = bags.joint(0, [0.125, math.nan], [math.nan, 0.25]), bags.battery(0, 0.5, 0.5, 0.5)
+    quiet, loud = (struct.pack("<Q", bits) for bits in (0x3FC0000000000000, 0x7FF0000000000001))
+    half, short = struct.pack("<f", 0.5), struct.pack("<I", 0x7F800001)
+    messages = []
+    for k, t in enumerate(STAMPS.tolist()):
+        stamp = struct.pack("<iI", *divmod(t, 10**9))
+        for topic, kind, raw, old, new in (("/joint_states", JOINT, joint, quiet, loud),
+                                           ("/armature", BATTERY, motor, half, short)):
+            raw = raw[:4] + stamp + raw[12:]
+            messages.append((topic, kind, t, raw.replace(old, new) if BAD[k] else raw))
+    messages.append(("/reference", FLOAT, int(STAMPS[5]), bags.number(0.125).replace(quiet, loud)))
+    with np.errstate(all="raise"):
+        recording = read(bags.write(tmp_path / "bag", bags.Content(messages)))
+        for name in ("theta", "i_a", "v_a", "duty"):
+            readings = getattr(recording, name)
+            assert np.flatnonzero(np.isnan(readings)).tolist() == [40, 41, 300]
+            assert np.isfinite(readings - 0.0).sum() == N - 3
+        assert np.isnan(recording.reference - 0.0).all()

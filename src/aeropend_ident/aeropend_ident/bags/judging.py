@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
@@ -40,6 +42,16 @@ MOSTLY = 0.9
 
 SHORTEST_PIECE = 0.5
 """[s] A piece between two settings of the clock that is shorter is a few wrong stamps (choice)."""
+
+
+def numbers(raw: NDArray[np.floating[Any]]) -> Floats:
+    """Numbers of messages, of any shape, as float64; a signalling NaN, at which numpy warns, is a plain one.
+
+    Args:
+        raw: as decoded.
+    """
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isnan(raw), np.nan, raw.astype(np.float64))
 
 
 def channel(name: str, values: Floats, notes: list[str]) -> Floats:

@@ -352,7 +352,7 @@ class _Join:
                 ("theta_dot", _ARM, "velocity"),
                 ("omega", _ROTOR, "velocity"),
             ):
-                values = block.numbers[field]
+                values = judging.numbers(block.numbers[field])
                 if joint in names and names.index(joint) < values.shape[1]:
                     columns[column][block.rows] = values[:, names.index(joint)]
         return self._table(series, blocks, columns)
@@ -362,7 +362,7 @@ class _Join:
         blocks = self._decode(series)
         for block in blocks:
             for column, field in (("v_a", "voltage"), ("i_a", "current"), ("duty", "percentage")):
-                columns[column][block.rows] = block.numbers[field]
+                columns[column][block.rows] = judging.numbers(block.numbers[field])
         return self._table(series, blocks, columns)
 
     def _values(self, series: _Series | None) -> tuple[Stamps, Floats]:
@@ -371,7 +371,7 @@ class _Join:
             return np.empty(0, np.int64), np.empty(0)
         blocks = self._decode(series)
         rows = np.concatenate([block.rows for block in blocks] or [np.empty(0, np.int64)])
-        values = np.concatenate([block.numbers["data"] for block in blocks] or [np.empty(0)]).astype(np.float64)
+        values = np.concatenate([judging.numbers(block.numbers["data"]) for block in blocks] or [np.empty(0)])
         times = np.array(series.times, dtype=np.int64)[rows]
         order = np.lexsort((rows, times))
         return times[order], values[order]
