@@ -164,6 +164,29 @@ def test_what_is_doubtful_is_told(tmp_path, capsys, options, says):
     assert says in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(("quantity", "unit"), [("theta", "turn"), ("omega", "Hz"), ("voltage", "V"), ("current", "A"),
+                                                ("reference", "deg")])
+def test_numbers_that_are_no_readings_are_left_out_and_counted(tmp_path, capsys, quantity, unit):
+    wrong = np.isin(np.arange(len(TIME)), [40, 41, 120])
+    path = put(tmp_path, "t,x,y\n" + lines(TIME, ANGLE / 360.0, np.where(wrong, 1.7e308, 1.0), form="{:.6g}"))
+    angle = () if quantity == "theta" else ("--theta", "x:turn")
+    recording = imported(tmp_path, path, "--time", "t:s", *angle, f"--{quantity}", f"y:{unit}")
+    said = capsys.readouterr().out
+    assert "note: 3 readings of " in said
+    assert "are no possible number (first " in said
+    assert "inf" not in said.replace("(first inf", "")
+    read = getattr(recording, {"voltage": "v_a", "current": "i_a"}.get(quantity, quantity))
+    assert np.abs(read[np.isfinite(read)]).max() < 10.0
+    assert quantity == "reference" or np.flatnonzero(np.isnan(read)).tolist() == [40, 41, 120]
+
+
+def test_a_table_without_a_possible_reading_is_refused(tmp_path, capsys):
+    path = put(tmp_path, "t,x\n" + lines(TIME, ANGLE * 0.0 + 1e300, form="{:.6g}"))
+    assert "no reading is left: 200 readings of theta are no possible number" in refused(
+        capsys, path, tmp_path / "bag", *MAPPED)
+    assert not (tmp_path / "bag").exists()
+
+
 def test_two_columns_of_one_name_go_by_number(tmp_path, capsys):
     path = put(tmp_path, "t,x,x\n" + lines(TIME, ANGLE, -ANGLE))
     assert "may be column 2 \"x\" and 3 \"x\": give its number" in refused(capsys, path, tmp_path / "bag", *MAPPED)

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which numbers can be a reading of a rig, and which stamps a time: recordings and nodes leave out all others."""
 
-MOST = {"theta": 1e4, "omega": 1e6, "i_a": 1e6, "v_a": 1e6, "duty": 1.0}
+MOST = {"theta": 1e4, "omega": 1e6, "i_a": 1e6, "v_a": 1e6, "duty": 1.0, "reference": 1e6}
 """Channel -> greatest amount of a reading.
 
 Choice: no small rig reaches it, even where somebody sends degrees, rpm, mA or mV, which are recognised later. A duty is
-a fraction (docs/interfaces.md)."""
+a fraction (docs/interfaces.md). A reference is an angle or a speed."""
 
 ROUNDING = 1e-3
 """Amount by which a duty may be beyond 1, and counts as 1 (choice: that of a duty in per mille, rounded)."""

@@ -58,7 +58,7 @@ def channel(name: str, values: Floats, notes: list[str]) -> Floats:
     """The readings of a channel (N,); NaN where a number can be none, with a note of their number.
 
     Args:
-        name: one of theta, omega, i_a, v_a, duty.
+        name: one of theta, omega, i_a, v_a, duty, reference.
         values: (N,) as recorded; NaN where nothing was measured.
         notes: gets the note.
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from aeropend_ident.bags import judging
 from aeropend_ident.tables import clock
 from aeropend_ident.tables.clock import ClockError, Dated
 from aeropend_ident.tables.table import Column, Floats, Ints, Table, TableError
@@ -151,17 +152,20 @@ def samples(table: Table, plan: Plan) -> Samples:
         channels["theta"], offset, sign = _angle(table, chosen["theta"], values["theta"], dated, plan, notes)
     for name in ("omega", "current", "voltage"):
         if name in chosen:
-            channels[CHANNELS[name]] = chosen[name][1].size * values[name]
+            channels[CHANNELS[name]] = _readings(CHANNELS[name], chosen[name][1], values[name], notes)
     if "duty" in chosen:
         channels["duty"] = _duty(table, chosen["duty"], values["duty"], plan, notes)
     elif plan.motor_off:
         channels["duty"] = np.zeros(len(dated.time))
-    if not channels.keys() - {"duty"}:
+    measured = [channels[name] for name in channels.keys() - {"duty"}]
+    if not measured:
         raise TableError(f"{table.path}: nothing measured is named: give --theta at least")
+    if not np.isfinite(measured).any():
+        raise TableError(f"{table.path}: no reading is left: {notes[-1]}")
     reference = None
     if "reference" in chosen:
         unit = chosen["reference"][1]
-        reference = unit.size * values["reference"]
+        reference = _readings("reference", unit, values["reference"], notes)
         if not unit.is_speed and sign:
             reference = sign * (reference - offset)
     first = float(dated.time[0])
@@ -188,7 +192,7 @@ def _doubts(table: Table, chosen: dict[str, tuple[int, Unit]], channels: dict[st
         notes.append(f"{rate:.4g} rows a second: is the unit of the time right?")
     if rate < SLOW:
         notes.append(f"{rate:.3g} rows a second are few: with less than {SLOW:g} little of the dynamics shows")
-    if "theta" in channels and np.nanmax(np.abs(channels["theta"])) > FAR:
+    if "theta" in channels and np.nanmax(np.abs(channels["theta"]), initial=0.0) > FAR:
         notes.append("theta goes round more than twice: are its unit and its zero right?")
     for name, (k, unit) in chosen.items():
         own = table.columns[k].unit
@@ -343,11 +347,17 @@ def _placed(dated: Dated, keep: Ints, values: Floats) -> Floats:
     return np.where(dated.rows >= 0, values[keep][dated.rows], np.nan)
 
 
+def _readings(channel: str, unit: Unit, raw: Floats, notes: list[str]) -> Floats:
+    """[SI] (N,) Readings of a channel; NaN where a number can be none."""
+    with np.errstate(over="ignore"):
+        return judging.channel(channel, unit.size * raw, notes)
+
+
 def _angle(table: Table, chosen: tuple[int, Unit], raw: Floats, dated: Dated, plan: Plan, notes: list[str]
            ) -> tuple[Floats, float, float]:
     """The angle from hanging [rad], the offset of the readings [rad], and their sign."""
     unit = chosen[1]
-    read = unit.size * raw
+    read = _readings("theta", unit, raw, notes)
     known_ = np.flatnonzero(np.isfinite(read))
     steps = np.diff(read[known_])
     wrapped = int((np.abs(steps) > 0.6 * TURN).sum())
@@ -432,7 +442,7 @@ def _described(table: Table, plan: Plan, chosen: dict[str, tuple[int, Unit]], ch
         if name == "theta":
             line += f", hanging at {plan.zero}" * (plan.zero is not None) + ", flipped" * plan.flip
         values = reference if name == "reference" else channels.get(CHANNELS.get(name, ""))
-        if values is not None:
+        if values is not None and np.isfinite(values).any():
             shown, size = ("rad/s", 1.0) if unit.is_speed else SHOWN_IN[name]
             line += f"; {size * np.nanmin(values):.4g} to {size * np.nanmax(values):.4g} {shown}"
         lines.append(line)
