@@ -3,6 +3,7 @@
 
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from rosbags.rosbag2 import Reader
 from aeropend_ident.bags.container import Bag
 from aeropend_ident.bags.recording import read
 from aeropend_ident.nodes.record import losses
-from aeropend_ident.nodes.replay import Plan
+from aeropend_ident.nodes.replay import Plan, Replay
 from aeropend_ident.nodes.topic_recorder import TopicRecorder
 
 FLOAT = "std_msgs/msg/Float64"
@@ -478,6 +479,7 @@ def test_record_refuses(processes, arguments, message):
         (["empty"], "empty: no topic"),
         (["rigs", "--ros-args", "-r", "__ns:=/x"], "several recorded topics would become /x/"),
         (["strange", "--ros-args", "-p", "topics:=strange"], "/strange cannot be replayed: message type no_msgs"),
+        (["late", "--ros-args", "-p", "clock:=10.0"], "late: was received beyond 2038, which /clock"),
     ],
 )
 def test_replay_refuses(bags, processes, arguments, message):
@@ -490,6 +492,7 @@ def test_replay_refuses(bags, processes, arguments, message):
 
     bags.store.register(get_types_from_msg("float64 x", "no_msgs/msg/No"))
     bags.write(processes.folder / "strange", bags.Content([("/strange", "no_msgs/msg/No", 5, bags.number(1.0))]))
+    bags.write(processes.folder / "late", bags.Content([("/reference", FLOAT, 2**62, bags.number(1.0))]))
     assert message in one_line(processes.start(*arguments, module="aeropend_ident.nodes.replay"), "replay")
 
 
@@ -542,3 +545,9 @@ def test_entry_points_start(processes):
         path = Path(sys.executable).with_name(program)
         said = subprocess.check_output([path, "--help"], env=processes.environment, text=True, timeout=60)
         assert program in said
+
+
+def test_a_wait_may_be_longer_than_any_clock_and_ends_when_it_is_told():
+    end = threading.Event()
+    threading.Timer(0.2, end.set).start()
+    assert not Replay._until(None, time.monotonic() + 1e15, end)

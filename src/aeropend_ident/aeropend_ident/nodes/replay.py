@@ -200,6 +200,8 @@ class Replay(Node):
         self._stop_duty: bool = settings["stop_duty"]
         topics = [topic.strip() for topic in settings["topics"].split(",") if topic.strip()]
         self._plan = Plan(path, topics, settings["namespace"], settings["start"])
+        if settings["clock"] and self._plan.end >= interface.LATEST_NS:
+            raise UserError(f"{path}: was received beyond 2038, which {CLOCK} cannot tell: leave clock out")
         for problem in self._plan.bag.problems:
             self.get_logger().warn(problem)
         self._outlets: dict[tuple[str, str], Publisher] = {}
@@ -303,7 +305,7 @@ class Replay(Node):
     def _until(self, deadline: float, end: threading.Event) -> bool:
         """Sleep until a deadline. False when it is time to end."""
         while (left := deadline - time.monotonic()) > SLEEP_S:
-            if end.wait(left - SLEEP_S / 2):
+            if end.wait(min(left - SLEEP_S / 2, threading.TIMEOUT_MAX)):
                 return False
         if left > 0:
             time.sleep(left)

@@ -39,6 +39,9 @@ QOS = QoSProfile(reliability=ReliabilityPolicy.RELIABLE, history=HistoryPolicy.K
 _NAN = math.nan
 _S = 1_000_000_000
 
+LATEST_NS = 2**31 * _S
+"""[ns] What no stamp reaches: its seconds have 32 bits with sign."""
+
 
 def stamp(stamp_ns: int) -> Time:
     """Convert a stamp (ns since the epoch) to a message."""
