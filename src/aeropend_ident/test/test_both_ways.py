@@ -81,6 +81,14 @@ def test_a_rig_that_nobody_calibrated_is_identified_both_ways(driven, channels):
         assert numbers["v_full"].value == pytest.approx(off(LINEAR, 3).model["v_full"], rel=1e-3)
 
 
+def test_a_rig_that_nobody_calibrated_is_identified_both_ways_by_a_speed_with_a_sign():
+    true = off(LINEAR, 3).with_effects({"coulomb_friction": {"accel": FRICTION}})
+    read, truth = rig.record(true, DUTY, 5)
+    speed = truth["omega"] + 0.5 * np.random.default_rng(0).standard_normal(len(T))
+    _, conclusions = found({**read, "omega": speed}, ("duty", "omega"), BENCH, fit_nominal=True)
+    assert_friction(conclusions)
+
+
 def test_a_duty_below_0_brakes_where_the_model_does_not_reverse(driven):
     one_way = from_flat({"model.reverse": 0.0}, base=LINEAR)
     s = as_signals(recording(T, driven["theta"], DUTY, v_a=driven["v_a"]), one_way)

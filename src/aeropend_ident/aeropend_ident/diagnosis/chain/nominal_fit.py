@@ -166,7 +166,8 @@ def _start_of_motor(chains: CutChains) -> Model:
         numbers = curve(n, dead, bend, load, lag)
         squares, scale = 0.0, []
         for s in recordings:
-            w, seen = np.sqrt(unit_lift(replace(model, model=numbers), s)), s.true_speed
+            lift, seen = unit_lift(replace(model, model=numbers), s), s.true_speed
+            w = np.sign(lift) * np.sqrt(np.abs(lift))
             known = np.isfinite(seen)
             scale.append(float(w[known] @ seen[known]) / max(float(w[known] @ w[known]), 1e-12))
             squares += float(np.sum((seen[known] - scale[-1] * w[known]) ** 2))
