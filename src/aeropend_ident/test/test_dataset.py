@@ -5,7 +5,9 @@ import pytest
 from sparse_data import simulated
 
 from aeropend_ident.bags.recording import RecordingError
-from aeropend_ident.identification.dataset import from_arrays
+from aeropend_ident.identification.dataset import from_arrays, from_readings
+from aeropend_ident.testing.rigs import BENCH, steps
+from aeropend_sim.model import rig
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
 
@@ -20,3 +22,12 @@ def test_bad_arrays_are_refused_in_one_line(change, words):
     with pytest.raises(RecordingError, match=words) as error:
         from_arrays(x, {"v_a": v}, SAMPLE_PERIOD)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_channel_that_is_not_used_may_be_missing():
+    duty = steps(8.0, 3)
+    columns = {**rig.record(BENCH, duty, 3)[0], "duty": duty}
+    columns["i_a"] = np.full(len(duty), np.nan)
+    data = from_readings(columns, SAMPLE_PERIOD, BENCH.sensing, ("theta", "theta_dot"), ("omega",))
+    assert data.states == ("theta", "theta_dot")

@@ -251,7 +251,7 @@ def _from_signals(name: str, signals: Signals, columns: Mapping[str, Array], sen
             SensorState("theta_stage1", {"theta": 1.0 / tau, "theta_stage1": -1.0 / tau}, "theta"),
             SensorState("theta_stage2", {"theta_stage1": 1.0 / tau, "theta_stage2": -1.0 / tau}, "theta")]
         seen = "theta_stage2"
-    floor = {k: NUMERIC * float(np.nanstd(signals.channel(k))) for k in CHANNELS}
+    floor = {k: NUMERIC * float(np.nanstd(signals.channel(k))) for k in states if k in CHANNELS}
     described["omega"] = columns["omega"]
     p = signals.pulses
     if p is not None:
