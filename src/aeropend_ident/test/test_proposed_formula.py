@@ -85,3 +85,11 @@ def test_the_units_of_all_shapes_fit():
 
 def test_a_term_that_is_zero_has_no_formula():
     assert propose({"theta": SEEN["theta"]}, UNITS, np.zeros(N), np.ones(N), "N") == []
+
+
+@pytest.mark.filterwarnings("error")
+def test_points_far_outside_of_the_data_are_no_obstacle():
+    x = SEEN["omega"]
+    at = np.array([0.0, 100.0, 200.0, 1e6])
+    found = propose({"omega": x}, UNITS, 1e-4 * x, np.full(N, 1e-4), "rad/s²", knots={"omega": at})
+    assert off(found[0]({"omega": x}), 1e-4 * x) < 0.1

@@ -49,6 +49,10 @@ BEAM = 4
 PARALLEL = 0.999
 """Square of the correlation above which two columns of the dictionary are one (choice)."""
 
+OUTSIDE = 1.5
+"""Farthest point of a learned curve, over the greatest size of its quantity (choice: shapes that grow exponentially
+have no number far outside)."""
+
 ALIKE = 0.02
 """RMS difference of two proposals, relative to the target's RMS, below which the longer one is left out (choice)."""
 
@@ -189,7 +193,8 @@ class _Data:
         self.weight = 1.0 / np.hypot(sd[chosen] / level, LEAST_SD)
         self.y = target[chosen] / level * self.weight
         self.level = level
-        self._knots = {name: np.unique(at) / self.span[name] for name, at in knots.items() if name in variables}
+        self._knots = {name: np.unique(np.clip(np.unique(at) / self.span[name], -OUTSIDE, OUTSIDE))
+                       for name, at in knots.items() if name in variables}
         self._lines = {name: np.array([np.interp(self.x[name], at, row) for row in np.eye(len(at))]).T
                        for name, at in self._knots.items()}
         curves = len(variables) - ("thrust" in variables and len(variables) > 1)
