@@ -166,3 +166,9 @@ def test_motor_answers_a_small_voltage_as_the_simulation_does():
                             n["J_m"], n["B_m"], n["k_load"], SAMPLE_PERIOD)
     for a, moved, limit in zip(answer, out[1] - out[0], (5e-3, 1.5e-3, 1.5e-3), strict=True):
         assert np.abs(a[0] - moved).max() < limit * np.abs(moved).max()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_response_that_diverges_has_numbers_all_the_same():
+    s = replace(recording({}, duration=10.0), period=2.0, pulses=None)
+    assert all(np.isfinite(term.left) for term in found("motor", s))

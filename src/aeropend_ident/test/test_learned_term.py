@@ -9,7 +9,7 @@ from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.results import Results, document
 from aeropend_ident.diagnosis.search.formula_fit import _proposals
 from aeropend_ident.diagnosis.search.hypotheses import hypotheses
-from aeropend_ident.diagnosis.search.learned_term import FORMS, Curve, Learned, defined, definition
+from aeropend_ident.diagnosis.search.learned_term import FORMS, Curve, Learned, _raised, defined, definition
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, recorded, steps
 from aeropend_sim.model import effect_file
 from aeropend_sim.model.effects import CATALOGUE, DEFINED
@@ -123,3 +123,10 @@ def test_formulas_are_proposed_for_two_curves_over_one_quantity():
 def test_the_catalogue_is_never_forgotten():
     effect_file.forget("gust")
     assert CATALOGUE["gust"] is DEFINED["gust"]
+
+
+@pytest.mark.filterwarnings("error")
+def test_responses_of_a_curve_with_which_a_simulation_diverges_are_numbers():
+    curve = Curve(FORMS["motor"][0], np.linspace(0.0, 1.0, 3))
+    raised = _raised(lambda values: {"i_a": np.array([np.inf, 1e300, np.nan]), "v_a": np.zeros(0)}, {}, curve)
+    assert all(np.isfinite(np.sum(response["i_a"] ** 2)) for response in raised)

@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from aeropend_ident.estimation.map_fit import Sensitivities, fit, screen, whittle
+from aeropend_ident.estimation.map_fit import LARGEST, Sensitivities, finite, fit, screen, whittle
 from aeropend_ident.estimation.parameter import Parameter
 from aeropend_ident.signals.statistics import effective_sample_size
 
@@ -144,3 +144,15 @@ def test_a_simulation_that_diverges_is_a_bad_fit_and_no_error(beyond):
     assert found.values["slope"] == pytest.approx(2.0, abs=5.0 * found.sd["slope"])
     far = Parameter("bend", 1.0, 1.0)
     assert screen(residuals, fit(residuals, [SLOPE, OFFSET, BEND]), [SLOPE, OFFSET, BEND], [[far]])
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_parameter_that_is_extrapolated_far_is_beyond_its_bounds():
+    assert Parameter("delay", 1.0, 1.0, 0.1, 10.0, log=True).value(1e4) == np.inf
+
+
+@pytest.mark.filterwarnings("error")
+def test_residuals_of_a_simulation_that_diverges_stay_numbers():
+    assert finite(np.array([1.0, np.nan, -np.inf, 1e300])).tolist() == [1.0, LARGEST, -LARGEST, LARGEST]
+    assert finite(np.array([[1.0, 1e40]]), 1e30).tolist() == [[1.0, 1e30]]
+    assert finite(np.zeros((0, 3))).shape == (0, 3)

@@ -5,7 +5,13 @@ import pytest
 from sparse_data import STATES, TRUE, noisy, pushed, simulated
 
 from aeropend_ident.identification.dataset import from_arrays
-from aeropend_ident.identification.output_error import Entries, Fitter, low_frequency_power_ratio
+from aeropend_ident.identification.output_error import (
+    Entries,
+    Fitter,
+    low_frequency_power_ratio,
+    scaled_solve,
+    to_unit_diagonal,
+)
 from aeropend_ident.identification.problem import Problem
 from aeropend_ident.identification.terms import thesis_terms
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
@@ -67,3 +73,20 @@ def test_a_slow_residual_has_more_power_at_low_frequencies_than_white_noise():
     white = np.random.default_rng(0).standard_normal(20_000)
     assert low_frequency_power_ratio(white) == pytest.approx(1.0, abs=0.4)
     assert low_frequency_power_ratio(white + np.sin(np.arange(20_000) * 2e-3)) > 10.0
+
+
+@pytest.mark.filterwarnings("error")
+def test_sensitivities_of_an_unstable_model_stay_numbers():
+    fitter = linear()
+    states = fitter.run(*fitter.point)
+    fitter.model = Entries(fitter.model.equation, fitter.model.term, np.array([200.0, 1.0]))
+    normal, _ = fitter.normal_equations(states, fitter.model, fitter.residuals(states))
+    assert np.isfinite(normal.H).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_diagonal_that_rounding_made_negative_is_not_scaled():
+    H = np.array([[-1e30, 1e29], [1e29, 1e36]])
+    assert to_unit_diagonal(H).tolist() == [1.0, 1e-18]
+    with pytest.raises(np.linalg.LinAlgError):
+        scaled_solve(H, np.ones(2))

@@ -393,9 +393,9 @@ def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence
     return Fit(values, sd, search.current, search.scale, search.ess, log_prior, products, search.prior)
 
 
-def finite(r: Array) -> Array:
-    """Residuals (N,) of which each is at most `LARGEST`, also where a simulation diverges."""
-    return r if np.abs(r).max() <= LARGEST else np.clip(np.nan_to_num(r, nan=LARGEST), -LARGEST, LARGEST)
+def finite(r: Array, largest: float = LARGEST) -> Array:
+    """Residuals of any shape, or their slopes, of which each is at most so large, also where a simulation diverges."""
+    return r if np.abs(r).max(initial=0.0) <= largest else np.clip(np.nan_to_num(r, nan=largest), -largest, largest)
 
 
 def sensitivities(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter]

@@ -87,7 +87,10 @@ class Parameter:
 
     def value(self, z: float) -> float:
         """The inverse of `to_standard`."""
-        return float(self.mean * np.exp(self.sd * z)) if self.log else float(self.mean + self.sd * z)
+        if not self.log:
+            return float(self.mean + self.sd * z)
+        with np.errstate(over="ignore"):  # an extrapolation may go anywhere before its bounds hold it
+            return float(self.mean * np.exp(self.sd * z))
 
     def slope(self, z: float) -> float:
         """Derivative of the value with respect to z."""

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.blas import dsyrk
 
+from aeropend_ident.estimation.map_fit import finite
 from aeropend_ident.identification.free_run import RightHandSide, Wanted, run, sensitivities
 from aeropend_ident.identification.terms import Array, Indices, Library
 from aeropend_ident.signals.statistics import effective_sample_size
@@ -33,6 +34,9 @@ SLOWEST = 100
 
 FAR = 1e3
 """Distance of a state from its median, over the range of its readings, at which a run counts as diverged. Choice."""
+
+LARGEST = 1e30
+"""Largest sensitivity (choice: one beyond it is of an unstable model, and products of it are still numbers)."""
 
 CHUNK_BYTES = 4_000_000
 """[B] Greatest size of the array of sensitivities that is held at a time. Choice: as large as a processor's cache."""
@@ -423,6 +427,7 @@ class Fitter:
             z = min(a + chunk, len(part), int(edges[block + 1]) - first)
             J = np.empty((z - a, len(outputs), total))
             sensitivities(x[a:z], part.inputs[a:z], part.period, self.steps, model, columns, carry, J)
+            J = finite(J, LARGEST)
             for k, o in enumerate(part.outputs):
                 weight = 1.0 / (o.sigma * self.weights.scale[o.name] * np.sqrt(self.weights.variance_inflation[o.name]))
                 known = np.isfinite(o.value[a:z])
@@ -529,7 +534,7 @@ class Fitter:
         residuals = self.residuals(states)
         self.reweigh(residuals)
         normal, _ = self.normal_equations(states, self.model, residuals)
-        d = 1.0 / np.sqrt(np.maximum(np.diag(normal.H), 1e-300))
+        d = to_unit_diagonal(normal.H)
         return d[:, None] * np.linalg.pinv(d[:, None] * normal.H * d, hermitian=True) * d
 
 
@@ -557,13 +562,19 @@ def _squared(rows: Array) -> Array:
     return np.asarray(low + np.tril(low, -1).T)
 
 
+def to_unit_diagonal(H: Array) -> Array:
+    """(P,) Factors of rows and columns that make the diagonal 1; 1 where an element is 0, or below it by rounding."""
+    diagonal = np.diag(H)
+    return np.where(diagonal > 0.0, 1.0 / np.sqrt(np.maximum(diagonal, 1e-300)), 1.0)
+
+
 def scaled_solve(H: Array, g: Array) -> Array:
     """Solve H x = g for a symmetric positive definite H whose rows have very different sizes.
 
     Raises:
         numpy.linalg.LinAlgError: H is not positive definite.
     """
-    d = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+    d = to_unit_diagonal(H)
     low = np.linalg.cholesky(d[:, None] * H * d)
     return np.asarray(d * np.linalg.solve(low.T, np.linalg.solve(low, d * g)))
 

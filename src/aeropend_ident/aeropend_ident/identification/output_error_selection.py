@@ -15,7 +15,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aeropend_ident.identification.output_error import Entries, Experiment, Fitter, ReducedNormalEquations
+from aeropend_ident.identification.output_error import (
+    Entries,
+    Experiment,
+    Fitter,
+    ReducedNormalEquations,
+    to_unit_diagonal,
+)
 from aeropend_ident.identification.subset_selection import (
     Change,
     addition_gains,
@@ -86,7 +92,7 @@ class QuadraticMisfit:
             penalty: increase of the criterion by each coefficient.
             equation: (P,) equation of each candidate.
         """
-        d = 1.0 / np.sqrt(np.maximum(np.diag(normal.H), 1e-300))
+        d = to_unit_diagonal(normal.H)
         self._usable = np.diag(normal.H) > USABLE
         self._H, self._g, self.c = d[:, None] * normal.H * d, d * normal.g, values / d
         self.penalty, self._equation = penalty, equation

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
-from aeropend_ident.estimation.map_fit import Fit, Search
+from aeropend_ident.estimation.map_fit import Fit, Search, finite
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.pulses import mean_speed
 from aeropend_ident.signals.signals import Signals
@@ -70,6 +70,9 @@ CHANCE = 3.0
 """Ratio of the share that curves explain of a residual to that of white noise above which it counts (choice).
 
 Measured: at ±30 % no verdict of 25 recordings changes (docs/results/thresholds.md)."""
+
+LARGEST = 1e30
+"""Largest response (choice: one beyond it is of a model that diverges, and products of it are still numbers)."""
 
 FOLDS = 5
 """Blocks of time of a cross-validation (convention)."""
@@ -386,13 +389,14 @@ def _rows(chain: CutChain, channel: str, response: Mapping[str, Array], count: i
         use = (p.index < s.train) & ~p.false
         if "angle" not in response:
             return np.zeros((count, int(use.sum())))
-        return np.array([(mean_speed(a, p.time, p.period, s.period) / p.sigma)[use] for a in response["angle"]])
+        return np.array([(mean_speed(a, p.time, p.period, s.period) / p.sigma)[use]
+                         for a in finite(response["angle"], LARGEST)])
     start = s.after_unseen if channel == "v_a" else 0
     measured = s.true_speed if channel == "omega" else s.channel(channel)
     known = np.isfinite(measured[start:s.train])
     if channel not in response:
         return np.zeros((count, int(known.sum())))
-    return response[channel][:, start:s.train][:, known] / s.sigma[channel]
+    return finite(response[channel], LARGEST)[:, start:s.train][:, known] / s.sigma[channel]
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from aeropend_ident.diagnosis.policy import GOOD_ENOUGH
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis
 from aeropend_ident.diagnosis.search.free_curves import FOLDS, MOST_SAMPLES, knots_of
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
-from aeropend_ident.estimation.map_fit import Fit, Search, fit, largest_ess
+from aeropend_ident.estimation.map_fit import Fit, Search, finite, fit, largest_ess
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_sim.model import actuator, effect_file
 from aeropend_sim.model.terms import along
@@ -437,9 +437,13 @@ def _raised(residuals: Callable[[dict[str, float]], Mapping[str, Array]], base: 
     own = {f"{id_}.{name}": 0.0 for name in c.names} | {f"{id_}.gain": 1.0}
     if c.form.rate:
         own[f"{id_}.tau"] = c.form.tau
-    still = residuals({**base, **own})
+
+    def at(values: dict[str, float]) -> dict[str, Array]:
+        return {k: finite(np.asarray(r)) for k, r in residuals({**base, **own, **values}).items() if len(r)}
+
+    still = at({})
     for name in c.names:
-        moved = residuals({**base, **own, f"{id_}.{name}": RISE[c.form.value_unit]})
+        moved = at({f"{id_}.{name}": RISE[c.form.value_unit]})
         yield {k: r + (moved[k] - r) / RISE[c.form.value_unit] for k, r in still.items()}
     effect_file.forget(id_)
 
