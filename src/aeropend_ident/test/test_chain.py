@@ -83,3 +83,8 @@ def test_a_channel_without_a_reading_to_fit_to_has_no_residual_and_any_delay():
     chain = CutChain.cut(BENCH, replace(signals, v_a=v_a))
     assert chain.residuals("actuator")({}) == {}
     assert chain.likeliest_delay({}) > 0.0
+
+
+def test_a_sample_period_above_every_delay_has_a_delay_all_the_same():
+    s = recorded(1, duration=8.0)
+    assert CutChain.cut(BENCH, replace(s, period=1.0)).likeliest_delay({}) == 0.5

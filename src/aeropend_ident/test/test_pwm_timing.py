@@ -3,6 +3,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
@@ -48,4 +49,13 @@ def test_other_recordings_keep_their_time(effects):
 def test_a_wrong_number_is_no_early_duty(number, factor):
     wrong = replace(BENCH, model={**BENCH.model, number: factor * BENCH.model[number]})
     chains = CutChains(wrong, [recorded(5, {}, off=0.0)])
+    assert with_pwm_timing(chains) is chains
+
+
+def test_a_slow_recording_keeps_its_time():
+    """Its current is read too seldom to show when a duty began to act, and a fit would take minutes."""
+    s = recorded(1, EARLY, duration=20.0)
+    slow = replace(s, period=0.1, pulses=None, omega=np.full(len(s), np.nan))
+    early = CutChains(BENCH.with_effects({"command_delay": {"delay": -0.05}}), [slow])
+    chains = CutChains(BENCH, [replace(slow, i_a=early.each[0].motor({})[0])])
     assert with_pwm_timing(chains) is chains

@@ -3,9 +3,10 @@ import math
 
 import numpy as np
 import pytest
+from readings import recording
 
 from aeropend_ident.bags.recording import RecordingError
-from aeropend_ident.signals.from_bag import signals_of
+from aeropend_ident.signals.from_bag import as_signals, signals_of
 from aeropend_ident.signals.outliers import joined_turns
 from aeropend_ident.signals.pulses import find_pulses
 from aeropend_ident.signals.signals import from_arrays
@@ -316,3 +317,18 @@ def test_a_speed_that_is_false_in_the_part_that_is_held_out_is_left_out_there():
     assert not np.isfinite(signals.omega[signals.train:]).any()
     assert signals.pulses.index.max() < signals.train
     assert "omega is false in the part that is held out: it is left out there" in signals.notes
+
+
+@pytest.mark.parametrize("fit_nominal", [False, True])
+def test_a_recording_that_is_too_slow_to_show_a_swing_is_refused(tmp_path, fit_nominal):
+    bags.write(tmp_path / "bag", columns(), 1_000_000_000)
+    with pytest.raises(RecordingError, match="its samples are 1 s apart, which shows no swing"):
+        signals_of(tmp_path / "bag", None, BENCH, fit_nominal=fit_nominal)
+
+
+def test_pieces_between_pauses_may_be_too_short_for_a_verdict(tmp_path):
+    made = {name: x[:60] for name, x in columns().items()}
+    steps_ns = np.where(np.arange(60) % 3 == 0, 11_000_000_000, 2_040_000)
+    read_ = recording(np.cumsum(steps_ns) * 1e-9, **made)
+    with pytest.raises(RecordingError, match="3 samples without a pause are too few for a verdict"):
+        as_signals(read_, BENCH, fit_nominal=True)

@@ -42,6 +42,9 @@ Choice: a command that is late by half of it moves the arm by less than a readin
 
 Measured: at ±30 % no verdict of 5 recordings changes (docs/results/thresholds.md)."""
 
+SLOWEST = 0.2
+"""[s] Longest sample period of a recording with a verdict (choice: five samples in a swing of the arm of `bench`)."""
+
 FOLLOWED = 0.9
 """Share of the steps of the duty that the commands must explain to fill in the samples that are lost (choice)."""
 
@@ -100,13 +103,17 @@ def as_signals(read: Recording, model: Model, held_out: float = 0.3, *, fit_nomi
         read = replace(read, theta=theta, notes=(*read.notes, said))
     if float(np.nanmin(read.duty, initial=0.0)) < -STILL:
         read = _driven_backward(read, reverses=fit_nominal or model.model["reverse"] > 0.0)
+    if read.period > SLOWEST:
+        raise RecordingError(f"{read.path}: its samples are {read.period:.3g} s apart, which shows no swing of an arm; "
+                             "record 20 or more a second")
     if not fit_nominal:
         check_period(read)
         piece = longest_piece(with_voltage_as_command(read, model.model["v_full"]) if model.model["v_full"] else read)
         return from_recording(checked(piece, model, mounting), model.sensing, held_out)
-    if len(read) < FEWEST:
-        raise RecordingError(f"{read.path}: {len(read)} samples are too few for a verdict")
-    piece = longest_piece(with_voltage_as_command(read))
+    piece = longest_piece(read)
+    if len(piece) < FEWEST:
+        raise RecordingError(f"{read.path}: {len(piece)} samples without a pause are too few for a verdict")
+    piece = with_voltage_as_command(piece)
     likely = mistakes.without_model(piece.theta, piece.duty, piece.i_a, piece.v_a)
     piece = replace(piece, notes=(*piece.notes, *(one.text for one in likely)))
     return from_uncalibrated(piece, model.sensing, held_out)

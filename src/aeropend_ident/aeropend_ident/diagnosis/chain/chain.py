@@ -121,7 +121,7 @@ class CutChain:
     def likeliest_delay(self, values: Values) -> float:
         """[s] The command delay that fits the voltage best; the middle of its sample period, in which all fit alike."""
         high = CATALOGUE["command_delay"].parameters["delay"].high
-        tried = (np.arange(math.floor(high / self.signals.period)) + 0.5) * self.signals.period
+        tried = (np.arange(max(math.floor(high / self.signals.period), 1)) + 0.5) * self.signals.period
         errors = [sum(float(r @ r) for r in self.actuator_residuals({**values, DELAY: d}).values()) for d in tried]
         return float(tried[int(np.argmin(errors))])
 

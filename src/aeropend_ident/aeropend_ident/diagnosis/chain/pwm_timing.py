@@ -18,6 +18,7 @@ from aeropend_ident.diagnosis.chain.chain import DELAY, CutChain, CutChains
 from aeropend_ident.diagnosis.chain.priors import initial_states, model_parameters
 from aeropend_ident.estimation.map_fit import fit
 from aeropend_ident.estimation.parameter import Parameter
+from aeropend_ident.signals.signals import SETTLED
 from aeropend_sim.model.parameters import Model
 
 Array = NDArray[np.float64]
@@ -37,6 +38,8 @@ def with_pwm_timing(chains: CutChains) -> CutChains:
     if "command_delay" in model.effects or not all(s.has("v_a") and s.has("i_a") for s in chains.recordings):
         return chains
     lead = 0.5 * chains.each[0].signals.period
+    if lead > SETTLED:  # no current is read that would show it
+        return chains
     note = (f"the duty acts {1e3 * lead:.2f} ms before the sample that first reports it, as with a phase-correct PWM: "
             f"the model is given a command_delay of {-1e3 * lead:.2f} ms")
     early = _copy(chains, model.with_effects({**model.effects, "command_delay": {"delay": -lead}}), note)
