@@ -88,3 +88,8 @@ def test_the_drawing_holds_response_reference_and_duty():
     assert (np.diff(points[1][:, 1]) <= 0.0).all()  # upwards on the page
     assert all(one[:, 0].min() >= 70.0 and one[:, 0].max() <= 870.0 for one in points)
     assert "a < b" in "".join(root.itertext())
+
+
+def test_a_single_sample_is_no_step_response():
+    with pytest.raises(StepError, match="a single sample shows no step response"):
+        step_report.on_grid([1.0], {"theta": [0.2]}, float("nan"))

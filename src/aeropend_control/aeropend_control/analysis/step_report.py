@@ -77,9 +77,11 @@ def on_grid(time: ArrayLike, columns: Mapping[str, ArrayLike], period: float = S
         Time [s] (M,), the columns (M,), and the number of missing samples.
 
     Raises:
-        StepError: nearly all samples are missing.
+        StepError: nearly all samples are missing, or there is one only.
     """
     t = np.asarray(time, dtype=float)
+    if len(t) < 2:
+        raise StepError("a single sample shows no step response")
     count = round((t[-1] - t[0]) / period) + 1
     if count > MOST_MISSING * len(t):
         raise StepError(f"{count - len(t)} samples are missing beside {len(t)}: a stamp must be wrong")
