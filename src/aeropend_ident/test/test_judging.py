@@ -176,3 +176,11 @@ def test_a_signalling_nan_is_a_plain_one(bags, tmp_path):
             assert np.flatnonzero(np.isnan(readings)).tolist() == [40, 41, 300]
             assert np.isfinite(readings - 0.0).sum() == N - 3
         assert np.isnan(recording.reference - 0.0).all()
+
+
+def test_receive_times_of_another_age_move_no_stamps(bags, tmp_path):
+    stamps = STAMPS - np.where(np.arange(N) < 200, 0, 5 * 10**9)
+    received = np.where(np.arange(N) < 200, STAMPS, STAMPS + 2**62)
+    recording = read(written(bags, tmp_path, stamps=stamps, received=received))
+    assert (np.diff(recording.stamp_ns) > 0).all()
+    assert recording.stamp_ns.tolist() == sorted(set(stamps.tolist()))

@@ -34,6 +34,9 @@ SET_BACK, SET_FORWARD = SECOND, 3600 * SECOND
 
 Choice: one rig's messages arrive in order, and a recorder that hangs does not hang for an hour."""
 
+LATEST = 2**31 * SECOND
+"""[ns] What no stamp reaches: its seconds have 32 bits with sign."""
+
 NEIGHBOURS = 3
 """Stamps on either side with which a single one is compared (choice)."""
 
@@ -150,6 +153,8 @@ def one_clock(stamps: Stamps, received: Stamps, notes: list[str]) -> tuple[Stamp
             pause = max(round(int(r[start] - r[end]) / period), 1)
             shift = int(moved[end]) + round(pause * period) - int(s[start])
             if abs(shift) > SET_BACK or s[start] <= moved[end]:
+                if not 0 <= int(s[start]) + shift <= int(s[stop - 1]) + shift < LATEST:  # receive times of another age
+                    return stamps, np.ones(len(stamps), dtype=bool)
                 moved[start:stop] += shift
                 set_by.append(int(s[start] - s[end]) / SECOND)
         end = stop - 1
