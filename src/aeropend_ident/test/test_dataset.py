@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from readings import recording
 from sparse_data import simulated
 
 from aeropend_ident.bags.recording import RecordingError
-from aeropend_ident.identification.dataset import from_arrays, from_readings
+from aeropend_ident.identification.dataset import from_arrays, from_bag, from_readings
 from aeropend_ident.testing.rigs import BENCH, steps
 from aeropend_sim.model import rig
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
@@ -31,3 +32,11 @@ def test_a_channel_that_is_not_used_may_be_missing():
     columns["i_a"] = np.full(len(duty), np.nan)
     data = from_readings(columns, SAMPLE_PERIOD, BENCH.sensing, ("theta", "theta_dot"), ("omega",))
     assert data.states == ("theta", "theta_dot")
+
+
+def test_stamps_that_keep_no_sample_period_are_refused_in_one_line():
+    duty = steps(12.0, 3)
+    columns = {**rig.record(BENCH, duty, 3)[0], "duty": duty}
+    t = np.cumsum(np.where(np.arange(len(duty)) % 4 == 3, 0.4e-3, SAMPLE_PERIOD))
+    with pytest.raises(RecordingError, match="its stamps keep no sample period"):
+        from_bag(recording(t, **columns), BENCH.sensing)

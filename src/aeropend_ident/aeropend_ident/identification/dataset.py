@@ -198,6 +198,9 @@ def from_bag(read: Recording, sensing: Mapping[str, float], states: Sequence[str
         if name != "theta_dot":
             _check_channel(read, name)
     signals = from_recording(read, sensing, held_out)
+    if len(signals) != len(read):
+        raise RecordingError(f"{path}: its stamps keep no sample period (two rigs on one topic, or a clock that was "
+                             "set while recording); identification needs one; record again")
     columns = {name: getattr(read, name) for name in (*CHANNELS, "duty")}
     return _from_signals(path, signals, columns, sensing, states, inputs, held_out)
 
