@@ -265,6 +265,11 @@ def test_metadata_cannot_name_files_elsewhere(whole, tmp_path, name):
     """CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER,
        data BLOB AS (zeroblob(1000000000)))""",
     "CREATE VIRTUAL TABLE messages USING fts5(id, topic_id, timestamp, data)",
+    """CREATE VIEW messages AS SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp, zeroblob(9) AS data;
+       CREATE TABLE odd(a);
+       PRAGMA writable_schema=ON;
+       UPDATE sqlite_master SET sql = CAST(CAST('CREATE TABLE "a' AS BLOB) || x'ff' || CAST('"(a)' AS BLOB) AS TEXT)
+       WHERE name = 'odd'""",
 ])
 def test_a_database_that_computes_is_refused(whole, tmp_path, program):
     path = tmp_path / "a.db3"
@@ -272,6 +277,13 @@ def test_a_database_that_computes_is_refused(whole, tmp_path, program):
     with closing(sqlite3.connect(path)) as base:
         base.executescript(f"DROP TABLE messages; {program};")
     assert use(tmp_path, path) == [f"{path}: holds views or columns that compute what they show: not a bag"] * 2
+
+
+def test_a_database_whose_columns_have_no_names_is_one_line(whole, tmp_path):
+    data = whole["sqlite3"]["sqlite3.db3"]
+    (tmp_path / "a.db3").write_bytes(data.replace(b"serialization_format TEXT", b"serialization_forma\xa2 TEXT"))
+    assert (tmp_path / "a.db3").read_bytes() != data
+    assert len(use(tmp_path, tmp_path / "a.db3")) > 0
 
 
 def test_a_database_of_other_types_is_read_as_far_as_it_goes(whole, tmp_path):

@@ -103,10 +103,9 @@ def _check_tables(file: Path) -> None:
 
 
 def _refuse_programs(database: sqlite3.Connection, file: Path) -> None:
-    tables = database.execute("PRAGMA table_list").fetchall()
-    computed = [row for table in tables for row in database.execute("SELECT hidden FROM pragma_table_xinfo(?)",
-                                                                    (table[1],)) if row[0]]
-    if computed or any(table[2] != "table" for table in tables):
+    queries = ("SELECT 1 FROM pragma_table_list WHERE type != 'table'",  # names stay in SQLite: they may be no text
+               "SELECT 1 FROM pragma_table_list AS t JOIN pragma_table_xinfo(t.name) AS x WHERE x.hidden != 0")
+    if any(database.execute(query).fetchone() for query in queries):
         raise RecordingError(f"{file}: holds views or columns that compute what they show: not a bag")
 
 
@@ -161,7 +160,7 @@ def _rows(database: sqlite3.Connection, query: str, *arguments: Any) -> Iterator
     """Yield rows up to the first that cannot be read."""
     try:
         yield from database.execute(query, arguments)
-    except sqlite3.Error:
+    except (sqlite3.Error, UnicodeError):  # the latter for the name of a column
         return
 
 
