@@ -326,6 +326,14 @@ def test_a_recording_that_is_too_slow_to_show_a_swing_is_refused(tmp_path, fit_n
         signals_of(tmp_path / "bag", None, BENCH, fit_nominal=fit_nominal)
 
 
+@pytest.mark.parametrize("fit_nominal", [False, True])
+def test_stamps_of_two_scales_are_refused_before_they_fill_the_memory(fit_nominal):
+    made = columns(10.0)
+    t = np.where(np.arange(len(made["duty"])) < 3000, 1e-9, SAMPLE_PERIOD).cumsum()
+    with pytest.raises(RecordingError, match="they keep no sample period"):
+        as_signals(recording(t, **made), BENCH, fit_nominal=fit_nominal)
+
+
 def test_pieces_between_pauses_may_be_too_short_for_a_verdict(tmp_path):
     made = {name: x[:60] for name, x in columns().items()}
     steps_ns = np.where(np.arange(60) % 3 == 0, 11_000_000_000, 2_040_000)

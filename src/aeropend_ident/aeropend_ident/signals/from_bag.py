@@ -60,6 +60,9 @@ Measured: at ±30 % no verdict of 5 recordings changes (docs/results/thresholds.
 MOST_MISSING = 100
 """Greatest ratio of missing samples to samples with which a recording is simulated (choice; it bounds the memory)."""
 
+MOST_PLACES = 500
+"""Greatest ratio of the places of a grid to the samples on it (choice; it bounds the memory)."""
+
 BACKWARDS = 0.02
 """Voltage of the other sign, over the largest, that is no drive in both directions (choice: an offset)."""
 
@@ -303,9 +306,12 @@ def with_commands(duty: Array, read: Recording, index: NDArray[np.int64]) -> Arr
 
 def _columns(read: Recording, index: np.ndarray) -> dict[str, np.ndarray]:
     """The channels and the duty on the grid, by name; NaN where nothing was measured."""
-    columns = {}
+    columns, places = {}, int(index[-1]) + 1
+    if places > MOST_PLACES * len(read):
+        raise RecordingError(f"{read.path}: {len(read)} samples, but its stamps tell of {places}: they keep no sample "
+                             "period, so no verdict is possible; record again")
     for name in (*CHANNELS, "duty"):
-        columns[name] = np.full(int(index[-1]) + 1, np.nan)
+        columns[name] = np.full(places, np.nan)
         columns[name][index] = getattr(read, name)
     return columns
 
