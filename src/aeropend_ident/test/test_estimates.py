@@ -86,3 +86,18 @@ def test_holds_of_which_a_channel_was_not_read_do_not_count():
     read.i_a[len(read) // 2:] = np.nan
     some = estimates.plateaus(read, ["v_a", "i_a"], "bag")
     assert 3 <= len(some.columns["v_a"]) < len(every.columns["v_a"])
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("change", "says"), [
+    (lambda x: x[:1], "1 sample; give 30 or more"),
+    (lambda x: -x, "the current flows against the voltage"),
+])
+def test_a_winding_that_cannot_be_fitted_is_refused_in_one_line(change, says):
+    read = blocked(0)
+    kept = slice(0, len(change(read.i_a)))
+    for name in ("t", "v_a", "duty", "omega", "theta"):
+        setattr(read, name, getattr(read, name)[kept])
+    read.i_a = change(read.i_a)
+    with pytest.raises(BenchTestError, match=says):
+        estimates.blocked_recording(read, "bag")

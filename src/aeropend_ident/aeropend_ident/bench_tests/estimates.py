@@ -22,6 +22,7 @@ from aeropend_ident.tables.units import RPM
 from aeropend_sim.errors import UserError
 from aeropend_sim.model import actuator
 from aeropend_sim.model.parameters import PARAMETERS
+from aeropend_sim.wording import counted
 
 GEAR = 55.0 / 9.0
 """Gear ratio N1/N2 of the thesis. Its K_q refers to the propeller's side: k_thrust = K_q (55/9)² (3.3, 3.4)."""
@@ -34,6 +35,13 @@ SETTLED = 0.01
 
 HOLD = 1.0
 """[s] Least length of a plateau of the duty; its last half is used. Choice."""
+
+
+FEWEST = 30
+"""Samples of a recording below which the winding is not fitted (choice: ten for each parameter)."""
+
+FAR = 100.0
+"""Logarithm beyond which no resistance or time constant lies (choice: its exponential is a number)."""
 
 
 class BenchTestError(UserError):
@@ -251,11 +259,17 @@ def blocked_recording(recording: Recording, name: str) -> Found:
         raise BenchTestError(f"{name}: the rotor turned, so v_a is not R_a i_a; block it, or use --steady")
     if len(recording.gaps) or not np.isfinite(np.column_stack([v, i])).all():
         raise BenchTestError(f"{name}: samples or readings are missing; record again")
+    if len(t) < FEWEST:
+        raise BenchTestError(f"{name}: {counted(len(t), 'sample')}; give {FEWEST} or more")
     starts, sizes = holds(recording.duty)
     held = np.repeat(np.add.reduceat(v, starts) / sizes, sizes)  # the voltage over each hold, without its noise
     before = np.append(held[0], held[:-1])
     if np.ptp(np.add.reduceat(i, starts) / sizes) < SURE * float(np.std(np.diff(i))):
         raise BenchTestError(f"{name}: no current flows above its noise; record steps of the duty")
+
+    power = float(held @ i)
+    if not power > 0.0:
+        raise BenchTestError(f"{name}: the current flows against the voltage; turn one of them over")
 
     def current(p: Array) -> Array:
         """p: log R_a, log τ, and the share of a period by which a new voltage acts before the sample that shows it."""
@@ -265,13 +279,13 @@ def blocked_recording(recording: Recording, name: str) -> Found:
         driven[0] = i[0]
         return np.asarray(lfilter([1.0], [1.0, -decay], driven))
 
-    start = [math.log(float(np.sum(held * i) / np.sum(i * i))), math.log(recording.period), 0.25]
-    fit = least_squares(lambda p: current(p) - i, start, bounds=([-np.inf, -np.inf, 0.0], [np.inf, np.inf, 1.0]),
+    start = [math.log(power / float(i @ i)), math.log(recording.period), 0.25]
+    fit = least_squares(lambda p: current(p) - i, start, bounds=([-FAR, -FAR, 0.0], [FAR, FAR, 1.0]),
                         diff_step=1e-4, x_scale=[0.01, 0.1, 0.1])
     covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * 2.0 * fit.cost / (len(t) - 3)
     r, tau = math.exp(fit.x[0]), math.exp(fit.x[1])
     spread = np.sqrt(np.diag(covariance))
-    inductance = Estimate(r * tau, r * tau * math.sqrt(covariance[0, 0] + covariance[1, 1] + 2.0 * covariance[0, 1]),
+    inductance = Estimate(r * tau, r * tau * math.sqrt(max(float(covariance[:2, :2].sum()), 0.0)),
                           "H", "τ_e R_a")
     resistance = Estimate(r, r * float(spread[0]), "Ω", "fit of the winding")
     time_constant = Estimate(tau, tau * float(spread[1]), "s", "fit of the winding")
