@@ -334,6 +334,16 @@ def test_stamps_of_two_scales_are_refused_before_they_fill_the_memory(fit_nomina
         as_signals(recording(t, **made), BENCH, fit_nominal=fit_nominal)
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_single_reading_of_the_angle_is_refused_in_one_line():
+    made = columns()
+    made["theta"] = np.where(np.arange(len(made["duty"])) == 9, made["theta"], np.nan)
+    t = np.arange(len(made["duty"])) * SAMPLE_PERIOD
+    for fit_nominal in (False, True):
+        with pytest.raises(RecordingError, match="the arm angle was not read in the part that is fitted"):
+            as_signals(recording(t, **made), BENCH, fit_nominal=fit_nominal)
+
+
 def test_pieces_between_pauses_may_be_too_short_for_a_verdict(tmp_path):
     made = {name: x[:60] for name, x in columns().items()}
     steps_ns = np.where(np.arange(60) % 3 == 0, 11_000_000_000, 2_040_000)

@@ -163,6 +163,8 @@ def white_noise_at(t: Array, x: Array) -> float:
     """
     known = np.isfinite(x)
     t, x = t[known], x[known]
+    if len(x) < FEWEST:
+        return 0.0
     usual = np.abs(np.diff(t) / np.median(np.diff(t)) - 1.0) < 0.2
     found = []
     for order in ORDERS:
