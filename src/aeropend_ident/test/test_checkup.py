@@ -50,10 +50,10 @@ def test_a_good_recording_is_ok(path):
 
 
 @pytest.mark.parametrize(("change", "level", "words"), [
-    (lambda r: {"theta": r.theta * 180.0 / np.pi}, "warning", "`import BAG NEW --theta theta:deg` mends it"),
-    (lambda r: {"theta": -r.theta}, "warning", "`import BAG NEW --flip` mends it"),
+    (lambda r: {"theta": r.theta * 180.0 / np.pi}, "warning", "`import bag bag_mended --theta theta:deg` mends it"),
+    (lambda r: {"theta": -r.theta}, "warning", "`import bag bag_mended --flip` mends it"),
     (lambda r: {"theta": np.roll(r.theta, len(r) // 2)}, "warning", "hardly follows the duty"),
-    (lambda r: {"theta": r.theta + 0.4}, "warning", "`import BAG NEW --zero start` mends it"),
+    (lambda r: {"theta": r.theta + 0.4}, "warning", "`import bag bag_mended --zero start` mends it"),
     (lambda r: {"theta": r.theta * 1e-3}, "warning", "the arm hardly moves"),
     (lambda r: {"theta": np.full(len(r), np.nan)}, "error", "no arm angle"),
     (lambda r: {"duty": np.full(len(r), 0.3)}, "warning", "the duty stays at 0.3"),
@@ -65,6 +65,26 @@ def test_each_fault_of_a_recording_is_found(good, change, level, words):
     assert bad(of_bag.contents("bag", good)) == []
     assert [text for one, text in bad(of_bag.contents("bag", replace(good, **change(good))))
             if one == level and words in text]
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    ({"theta": 180.0 / np.pi}, "the angle is in deg"), ({"omega": 30.0 / np.pi}, "the speed is in rpm")])
+def test_what_the_model_shows_is_said_first_with_the_command_that_mends_it(bags, tmp_path, columns, change, words):
+    changed = {name: factor * columns[name] for name, factor in change.items()}
+    bag = bags.write(tmp_path / "bag", bags.content(len(columns["duty"]), columns=columns | changed))
+    (first, *more) = bad(of_bag.checks(str(bag), BENCH))
+    assert words in first[1]
+    assert f"`import {bag} {bag}_mended --" in first[1]
+    assert [text for _, text in more] == ["diagnose refuses it before this is mended"]
+
+
+def test_a_reading_that_is_left_out_is_no_ok(bags, tmp_path, columns):
+    theta = columns["theta"].copy()
+    theta[5000] = np.inf
+    bag = bags.write(tmp_path / "bag", bags.content(len(theta), columns=columns | {"theta": theta}))
+    ((level, text),) = bad(of_bag.checks(str(bag), BENCH))
+    assert level == "warning"
+    assert text.startswith("1 reading of theta is no possible number")
 
 
 def test_a_recording_that_is_broken_off_is_said(bags, tmp_path):

@@ -2,6 +2,7 @@
 """What cannot be a reading or a time is left out where a recording is read, and counted; or refused in one line."""
 
 import math
+import re
 import struct
 from itertools import product
 
@@ -70,9 +71,20 @@ def test_a_few_duties_beyond_1_are_left_out_and_a_rounding_counts_as_1(bags, tmp
 @pytest.mark.parametrize(("full", "option"), [(100.0, "%"), (255.0, "counts:255")])
 def test_duties_that_are_no_fractions_are_refused_with_the_command_that_mends_them(bags, tmp_path, full, option):
     bag = written(bags, tmp_path, columns={"duty": np.linspace(0.0, full, N)})
-    with pytest.raises(RecordingError, match=f"duty goes from 0 to {full:g}, .*`import BAG NEW --duty duty:{option}` "):
+    with pytest.raises(RecordingError) as refused:
         read(bag)
+    assert re.search(f"duty goes from 0 to {full:g}, .*`import .* .*_mended --duty duty:{option}` ", str(refused.value))
+    assert "exchanged" not in str(refused.value)
     assert read(bag, judged=False).duty[-1] == full
+
+
+def test_a_duty_may_be_exchanged_with_a_channel_that_can_be_a_duty(bags, tmp_path):
+    bag = written(bags, tmp_path, columns={"duty": np.linspace(0.0, 9.0, N), "v_a": np.linspace(0.0, 0.8, N)})
+    with pytest.raises(RecordingError) as refused:
+        read(bag)
+    assert "exchanged with the voltage" in str(refused.value)
+    assert "exchanged with the current" not in str(refused.value)
+    assert "`import BAG NEW" not in str(refused.value)
 
 
 def test_a_duty_that_is_infinite_for_a_while_is_left_out(bags, tmp_path):
@@ -102,7 +114,7 @@ def test_commands_in_percent_are_said_where_they_are_the_duty(bags, tmp_path):
     recording = read(bag)
     assert set(recording.duty) == {0.0, 1.0}
     (note,) = (note for note in recording.notes if note.startswith("1 of 2 duty_commands is beyond"))
-    assert "`import BAG NEW --duty duty:%` mends it" in note
+    assert "bag_mended --duty duty:%` mends it" in note
     assert set(read(bag, judged=False).duty) == {0.0, 40.0}
 
 

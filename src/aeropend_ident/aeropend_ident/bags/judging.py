@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from aeropend_ident.bags.mending import mend
 from aeropend_ident.bags.reading import RecordingError
 from aeropend_sim.readings import MOST, ROUNDING
 from aeropend_sim.wording import counted
@@ -57,13 +59,14 @@ def numbers(raw: NDArray[np.floating[Any]]) -> Floats:
         return np.where(np.isnan(raw), np.nan, raw.astype(np.float64))
 
 
-def channel(name: str, values: Floats, notes: list[str]) -> Floats:
+def channel(name: str, values: Floats, notes: list[str], others: Mapping[str, Floats] | None = None) -> Floats:
     """The readings of a channel (N,); NaN where a number can be none, with a note of their number.
 
     Args:
         name: one of theta, omega, i_a, v_a, duty, reference.
         values: (N,) as recorded; NaN where nothing was measured.
         notes: gets the note.
+        others: all channels as recorded, of which one may be the duty.
 
     Raises:
         RecordingError: the duties are no fractions.
@@ -78,15 +81,24 @@ def channel(name: str, values: Floats, notes: list[str]) -> Floats:
     known = values[np.isfinite(values)]
     if name == "duty" and int((np.abs(known) > 1.0).sum()) > MANY * len(known):
         low, high = float(known.min()), float(known.max())
-        unit, option = ("percent", "%") if max(-low, high) <= PERCENT else ("counts of 255", "counts:255")
-        raise RecordingError(
-            f"the duty goes from {low:.3g} to {high:.3g}, but is a fraction, -1 to 1: if it is in {unit}, `import BAG "
-            f"NEW --duty duty:{option}` mends it; if it is exchanged with the current, `import BAG NEW --duty i_a:1 "
-            "--current duty:A`, and with the voltage, `import BAG NEW --duty v_a:1 --voltage duty:V`")
+        raise RecordingError(f"the duty goes from {low:.3g} to {high:.3g}, but is a fraction, -1 to 1: "
+                             f"{'; '.join(_other_duties(low, high, others or {}))}")
     first = float(values[np.argmax(wrong)])
     notes.append(f"{counted(number, 'reading')} of {name} {'is' if number == 1 else 'are'} no possible number (first "
                  f"{first:g}, possible are {-MOST[name]:g} to {MOST[name]:g}): left out")
     return np.where(wrong, np.nan, values)
+
+
+def _other_duties(low: float, high: float, others: Mapping[str, Floats]) -> list[str]:
+    """What duties from `low` to `high` may be, the likeliest first: in another unit, or exchanged with a channel."""
+    unit, option = ("percent", "%") if max(-low, high) <= PERCENT else ("counts of 255", "counts:255")
+    out = [f"if it is in {unit}, {mend(f'--duty duty:{option}')} mends it"]
+    for name, what, option in (("i_a", "current", "--current duty:A"), ("v_a", "voltage", "--voltage duty:V")):
+        x = others.get(name, np.empty(0))
+        x = x[np.isfinite(x)]
+        if len(x) and np.ptp(x) > 0.0 and np.abs(x).max() <= 1.0 + ROUNDING:
+            out.append(f"if it is exchanged with the {what}, {mend(f'--duty {name}:1', option)}")
+    return out
 
 
 def clamped(commands: Floats, notes: list[str]) -> Floats:
@@ -99,8 +111,7 @@ def clamped(commands: Floats, notes: list[str]) -> Floats:
     beyond = int((np.abs(commands) > 1.0 + ROUNDING).sum())
     if beyond:
         notes.append(f"{beyond} of {counted(len(commands), 'duty_command')} {'is' if beyond == 1 else 'are'} beyond -1 "
-                     "to 1: taken as -1 or 1, as a rig does; if they are in percent, `import BAG NEW --duty duty:%` "
-                     "mends it")
+                     f"to 1: taken as -1 or 1, as a rig does; if they are in percent, {mend('--duty duty:%')} mends it")
     return np.clip(commands, -1.0, 1.0)
 
 

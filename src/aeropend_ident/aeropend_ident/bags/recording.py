@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from aeropend_ident.bags import judging
 from aeropend_ident.bags.cdr import Block, decode
 from aeropend_ident.bags.container import Bag
+from aeropend_ident.bags.mending import named
 from aeropend_ident.bags.reading import RecordingError
 from aeropend_sim.untrusted import printable
 from aeropend_sim.wording import counted
@@ -165,7 +166,8 @@ def read(path: Path | str, namespace: str | None = None, *, judged: bool = True)
     try:
         recording = _Join(rigs[found], notes, judged=judged).recording(str(path), found, complete=not bag.problems)
     except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from None
+        raise RecordingError(f"{path}: {named(str(error), path)}") from None
+    recording = replace(recording, notes=tuple(named(note, path) for note in recording.notes))
     if not bag.problems:
         return recording
     what = f"{bag.counts.total()} messages and {recording.duration:.3f} s of samples could be read"
@@ -285,7 +287,7 @@ class _Join:
             self.received[np.searchsorted(self.stamps, table.stamps)] = table.received
         self.columns = self._placed((armature, joints), CHANNELS)
         if judged:
-            self.columns = {name: judging.channel(name, x, notes) for name, x in self.columns.items()}
+            self.columns = {name: judging.channel(name, x, notes, self.columns) for name, x in self.columns.items()}
         self.command = self._values(topics.get("duty_command"))
         self.reference = self._values(topics.get("reference"))
         if not len(armature.stamps):

@@ -4,17 +4,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from aeropend_ident.bags import recording
+from aeropend_ident.bags.mending import mend, named
 from aeropend_ident.bags.recording import Recording, RecordingError
 from aeropend_ident.checkup.check import Check, error, ok, warning
 from aeropend_ident.identification import dataset
 from aeropend_ident.identification.excitation_quality import quality
 from aeropend_ident.signals import mistakes
-from aeropend_ident.signals.from_bag import as_signals
+from aeropend_ident.signals.from_bag import as_signals, likely_mistakes
+from aeropend_ident.signals.mistakes import Mistake
 from aeropend_ident.signals.signals import STILL
 from aeropend_ident.signals.smoothing import lag
 from aeropend_sim.model.parameters import Model
@@ -43,6 +45,9 @@ Choice: 10 simulated and 13 real rigs have 0.7 to 0.99."""
 SHORT = 30.0
 """[s] Length below which a recording is called short (choice)."""
 
+LEFT_OUT = "left out"
+"""What a note says of data that is not used."""
+
 
 def checks(path: str, model: Model, namespace: str | None = None) -> Iterator[Check]:
     """All findings.
@@ -61,23 +66,32 @@ def checks(path: str, model: Model, namespace: str | None = None) -> Iterator[Ch
     yield ok(path, f"{counted(len(read), 'sample')}, {read.duration:.1f} s{rate}, "
              f"with {', '.join(read.channels) or 'no channel'}")
     for note in read.notes:
-        yield ok(path, note)
+        yield (warning if LEFT_OUT in note else ok)(path, note)
     if not read.complete:
         yield warning(path, f"it was broken off or damaged: recover {path}")
-    yield from contents(path, read)
-    yield from _use(path, read, model)
+    likely = likely_mistakes(read, model)
+    if likely:
+        yield warning(path, named(mistakes.said(likely), path))
+    yield from contents(path, read, likely)
+    if sure := [one for one in likely if one.sure]:
+        until = " before this is mended" if any(one.options for one in sure) else ""
+        yield warning(path, f"diagnose refuses it{until}")
+    else:
+        yield from _use(path, read, model)
 
 
-def contents(path: str, read: Recording) -> Iterator[Check]:
+def contents(path: str, read: Recording, likely: Sequence[Mistake] = ()) -> Iterator[Check]:
     """What is wrong with the samples, the duty and the angle of a recording.
 
     Args:
         path: of the recording.
         read: the recording.
+        likely: mistakes that the model shows; the angle is then judged no further.
     """
     yield from _samples(path, read)
     yield from _duty(path, read)
-    yield from _angle(path, read)
+    if not likely or not np.isfinite(read.theta).any():
+        yield from _angle(path, read)
 
 
 def _samples(path: str, read: Recording) -> Iterator[Check]:
@@ -113,17 +127,17 @@ def _angle(path: str, read: Recording) -> Iterator[Check]:
         yield error(path, "no arm angle (joint_states, position of 'arm'): nothing can be diagnosed; record it")
         return
     for one in mistakes.without_model(read.theta, read.duty, read.i_a, read.v_a):
-        yield warning(path, one.text)
+        yield warning(path, named(mistakes.said([one]), path))
     if (span := float(np.ptp(known))) < SMALL:
         yield warning(path, f"the angle spans only {span:.2g} rad: the arm hardly moves, or it has another unit")
     rest = resting_angle(read)
     if rest is not None and abs(rest) > OFF_ZERO:
         yield warning(path, f"at rest without duty the angle is {rest:.2g} rad, where it should be 0: set the zero "
-                      f"(calibrate); {mistakes.mend('--zero start')} mends it")
+                      f"(calibrate); {named(mend('--zero start'), path)} mends it")
     follows = following(read)
     if follows < -FOLLOWS:
         yield warning(path, "the angle falls where the duty rises: if its sign is wrong, "
-                      f"{mistakes.mend('--flip')} mends it")
+                      f"{named(mend('--flip'), path)} mends it")
     elif abs(follows) < FOLLOWS:
         yield warning(path, "the angle hardly follows the duty: check that this duty drove the motor")
 
@@ -156,7 +170,7 @@ def _use(path: str, read: Recording, model: Model) -> Iterator[Check]:
         except RecordingError as other:
             yield error(path, f"no diagnosis can use it: {str(other).removeprefix(f'{path}: ')}")
         else:
-            yield warning(path, f"only diagnose --uncalibrated can use it: {reason}")
+            yield warning(path, f"{reason}; only diagnose --uncalibrated can use it")
         return
     try:
         excited = quality(model.with_effects({}), dataset.from_bag(read, model.sensing, held_out=0.0))

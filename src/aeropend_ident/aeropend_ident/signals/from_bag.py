@@ -17,10 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.bags import recording
+from aeropend_ident.bags.mending import named
 from aeropend_ident.bags.recording import Recording, RecordingError
 from aeropend_ident.signals import mistakes
 from aeropend_ident.signals.free_decay import degrees, free_decay
 from aeropend_ident.signals.grid import check_period, irregular_grid, longest_piece, regular_grid
+from aeropend_ident.signals.mistakes import Mistake
 from aeropend_ident.signals.noise import reading_noise_at, white_noise_at
 from aeropend_ident.signals.outliers import joined_turns, jumps_out
 from aeropend_ident.signals.pulses import hold
@@ -118,7 +120,7 @@ def as_signals(read: Recording, model: Model, held_out: float = 0.3, *, fit_nomi
         raise RecordingError(f"{read.path}: {len(piece)} samples without a pause are too few for a verdict")
     piece = with_voltage_as_command(piece)
     likely = mistakes.without_model(piece.theta, piece.duty, piece.i_a, piece.v_a)
-    piece = replace(piece, notes=(*piece.notes, *(one.text for one in likely)))
+    piece = replace(piece, notes=(*piece.notes, *(named(mistakes.said([one]), read.path) for one in likely)))
     return from_uncalibrated(piece, model.sensing, held_out)
 
 
@@ -133,18 +135,29 @@ def checked(read: Recording, model: Model, mounting: Mounting | None = None) -> 
     Raises:
         RecordingError: a mistake is sure: no result could be right.
     """
+    likely = likely_mistakes(read, model, mounting)
+    if sure := [one for one in likely if one.sure]:
+        raise RecordingError(f"{read.path}: {named(mistakes.said(sure), read.path)}")
+    return replace(read, notes=(*read.notes, *(named(mistakes.said([one]), read.path) for one in likely)))
+
+
+def likely_mistakes(read: Recording, model: Model, mounting: Mounting | None = None) -> list[Mistake]:
+    """Likely mistakes of units, signs, zero and columns in a recording of a calibrated rig.
+
+    Args:
+        read: the recording.
+        model: the nominal model.
+        mounting: of the angle's sensor, if it is known.
+    """
     piece = longest_piece(read)
     if not piece.period > 0.0 or piece.duration > MOST_MISSING * len(piece) * piece.period:
-        return read
+        return []
     index, period = regular_grid(piece)
     columns = _columns(piece, index)
     if not np.isfinite(columns["duty"]).any():
-        return read
+        return []
     columns["theta"] = (mounting or Mounting()).upright(columns["theta"])
-    likely = mistakes.found(columns, hold(columns["duty"]), period, model)
-    if sure := [one for one in likely if one.sure]:
-        raise RecordingError(f"{read.path}: {sure[0].text}")
-    return replace(read, notes=(*read.notes, *(one.text for one in likely)))
+    return mistakes.found(columns, hold(columns["duty"]), period, model)
 
 
 def _driven_backward(read: Recording, *, reverses: bool) -> Recording:

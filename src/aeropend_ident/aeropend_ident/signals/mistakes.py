@@ -8,7 +8,7 @@ the units, one with the wrong sign goes against it, and that of another column f
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from aeropend_ident.bags.mending import mend
+from aeropend_sim.model.actuator import voltage
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import Model
 from aeropend_sim.model.rig import record
@@ -72,6 +74,9 @@ RISES = 0.3
 
 Measured: of 120 rigs of the blind check the least is 0.83."""
 
+DRIVEN = 0.2
+"""Share of the voltage, or speed, of full duty by which it varies only if the duty does (choice: a supply sags less)."""
+
 STILL = 0.01
 """Width of the levels of the duty (choice)."""
 
@@ -86,7 +91,8 @@ class Unit:
     Attributes:
         name: as `import` knows it.
         ratio: its number for 1 of the right unit.
-        sure: whether no rig with the right unit reads as much.
+        sure: whether no rig with the right unit reads as much; else it is sure if the angle fits the model, which the
+            speed makes.
     """
 
     name: str
@@ -109,15 +115,24 @@ OPTIONS = {"theta": "theta", "omega": "omega", "i_a": "current", "v_a": "voltage
 
 @dataclass(frozen=True)
 class Mistake:
-    """A likely mistake: what it looks like with the command that mends it, and whether no verdict can be right."""
+    """A likely mistake.
 
-    text: str
+    Attributes:
+        what: what it looks like.
+        sure: whether no verdict can be right.
+        options: those of `import` that mend it; none if nothing does.
+    """
+
+    what: str
     sure: bool
+    options: tuple[str, ...] = ()
 
 
-def mend(*options: str) -> str:
-    """The command that mends it with these options of `import`."""
-    return f"`import BAG NEW {' '.join(options)}`"
+def said(likely: Sequence[Mistake]) -> str:
+    """One line on mistakes, at least one, with the command that mends all of them."""
+    what = "; ".join(one.what for one in likely)
+    options = [option for one in likely for option in one.options]
+    return f"{what}: {mend(*options)} mends {'it' if len(likely) == 1 else 'them'}" if options else what
 
 
 def without_model(theta: Array, duty: Array, i_a: Array, v_a: Array) -> list[Mistake]:
@@ -133,8 +148,8 @@ def without_model(theta: Array, duty: Array, i_a: Array, v_a: Array) -> list[Mis
     known = theta[np.isfinite(theta)]
     span = _span(known) if len(known) else 0.0
     if span > TURNS:
-        out.append(Mistake(f"the angle spans {span:.3g} rad, more than two turns: if it is in degrees, "
-                           f"{mend('--theta theta:deg')} mends it", sure=False))
+        out.append(Mistake(f"the angle spans {span:.3g} rad, more than two turns, and may be in degrees", sure=False,
+                           options=("--theta theta:deg",)))
     of_voltage, of_current = (_beside_duty(x, duty) for x in (v_a, i_a))
     if of_voltage > EXCHANGED * of_current and _correlation(v_a, duty) > RISES:
         out.append(replace(_exchanged("i_a", "v_a", "the current depends on the duty alone, the voltage does not"),
@@ -170,11 +185,12 @@ def found(readings: Mapping[str, Array], duty: Array, period: float, model: Mode
     """
     if not np.isfinite(duty).all() or len(duty) < LEAST:
         return []
+    if (wrong := _not_the_duty(readings, duty, model)) is not None:
+        return [wrong]
     simulated = record(model, duty, period=period)[0]
     if (name := _exchanged_with_duty(readings, duty, period, model, simulated)) is not None:
-        options = mend(f"--duty {name}:1", f"--{OPTIONS[name]} duty:{OWN[name]}")
-        return [Mistake(f"it looks as if duty and {NAMES[name]} are exchanged (the rig follows {name} as its duty): "
-                        f"{options} mends it", sure=True)]
+        return [Mistake(f"it looks as if duty and {NAMES[name]} are exchanged (the rig follows {name} as its duty)",
+                        sure=True, options=(f"--duty {name}:1", f"--{OPTIONS[name]} duty:{OWN[name]}"))]
     pairs = {}
     for name in OWN:
         x, y = simulated[name], readings[name]
@@ -185,12 +201,27 @@ def found(readings: Mapping[str, Array], duty: Array, period: float, model: Mode
     out: list[Mistake | None] = [_exchanged(a, b, f"{a} fits the simulated {b}, {b} the simulated {a}")
                                  for a, b in twos]
     driven = np.ptp(duty) >= STILL
+    same_rig = "theta" in pairs and _fits(*pairs["theta"])
     for name, pair in pairs.items():
         if not any(name in two for two in twos):
-            out.append(_of_channel(name, *pair) or (_absurd(name, *pair) if driven else None))
+            out.append(_of_channel(name, *pair, same_rig=same_rig) or (_absurd(name, *pair) if driven else None))
     if not any(out):
         out.append(_slipped(readings["theta"], period))
     return [one for one in out if one is not None]
+
+
+def _not_the_duty(readings: Mapping[str, Array], duty: Array, model: Model) -> Mistake | None:
+    """Whether the motor is driven although the duty (N,) stays where it is."""
+    if np.ptp(duty) >= STILL:
+        return None
+    full = float(voltage(model.model, 1.0))
+    for name, most in (("v_a", full), ("omega", full / model.model["K_e"])):
+        known = readings[name][np.isfinite(readings[name])]
+        if len(known) >= LEAST and (span := _span(known)) > DRIVEN * most:
+            return Mistake(f"the duty stays at {float(duty[-1]):.2g}, but the {NAMES[name]} varies by {span:.3g} "
+                           f"{OWN[name]}: another duty drove the motor; record armature or duty_command with it",
+                           sure=True)
+    return None
 
 
 def _exchanged_with_duty(readings: Mapping[str, Array], duty: Array, period: float, model: Model,
@@ -227,8 +258,8 @@ def _error(y: Array, x: Array) -> float:
 
 
 def _exchanged(a: str, b: str, why: str) -> Mistake:
-    options = mend(f"--{OPTIONS[a]} {b}:{OWN[a]}", f"--{OPTIONS[b]} {a}:{OWN[b]}")
-    return Mistake(f"it looks as if {NAMES[a]} and {NAMES[b]} are exchanged ({why}): {options} mends it", sure=True)
+    return Mistake(f"it looks as if {NAMES[a]} and {NAMES[b]} are exchanged ({why})", sure=True,
+                   options=(f"--{OPTIONS[a]} {b}:{OWN[a]}", f"--{OPTIONS[b]} {a}:{OWN[b]}"))
 
 
 def _slipped(theta: Array, period: float) -> Mistake | None:
@@ -260,32 +291,53 @@ def _absurd(name: str, x: Array, y: Array) -> Mistake | None:
                    "the model with the same duty: check its unit, or give the model file of the rig", sure=True)
 
 
-def _of_channel(name: str, x: Array, y: Array) -> Mistake | None:
-    """The mistake that the readings (N,) beside their simulation (N,) show."""
+def _follows(x: Array, y: Array) -> tuple[float, float]:
+    """Correlation of readings y (N,) with their simulation x (N,), and how many times as far they go."""
     sx, sy = float(np.std(x)), float(np.std(y))
     r = float(np.mean((x - x.mean()) * (y - y.mean()))) / (sx * sy)
+    return r, sy / sx * abs(r)
+
+
+def _fits(x: Array, y: Array) -> bool:
+    """Whether readings y (N,) go as their simulation x (N,) does, in the unit of the model or in another."""
+    r, ratio = _follows(x, y)
+    return abs(r) >= FOLLOWS and any(1.0 / CLOSE < ratio / size < CLOSE
+                                     for size in (1.0, *(unit.ratio for unit in UNITS["theta"])))
+
+
+def _of_channel(name: str, x: Array, y: Array, *, same_rig: bool) -> Mistake | None:
+    """The mistake that the readings y (N,) beside their simulation x (N,) show.
+
+    Args:
+        name: of the channel.
+        x: (N,) simulated.
+        y: (N,) read.
+        same_rig: whether the angle shows that the model is of this rig.
+    """
+    r, ratio = _follows(x, y)
     if abs(r) < FOLLOWS:
         return None
-    ratio = sy / sx * abs(r)
     unit = next((u for u in UNITS[name] if 1.0 / CLOSE < ratio / u.ratio < CLOSE), None)
     turned = r < 0.0
     against = f"it goes {'against' if turned else 'with'} the simulated one, {ratio:.3g} times as far"
+    size = 1.0 if unit is None else unit.ratio
+    zero = float(np.median(y - (-size if turned else size) * x))
+    off = name == "theta" and 1.0 / CLOSE < ratio / size < CLOSE and abs(zero) > OFF_ZERO * size
+    hangs = f"{zero:.2f}rad" if unit is None else f"{zero:.3g}{unit.name}"
+    options = (f"--zero {hangs}",) if off else ()
     if unit is not None:
         what = f"is in {unit.name}{' and turned over' * turned}"
     elif turned and 1.0 / OPPOSITE < ratio < OPPOSITE:
         what = "is turned over"
+    elif off and not turned:
+        return Mistake(f"it looks as if the arm hung at a reading of {zero:.2f} rad, not 0 (check that it does)",
+                       abs(zero) > ZERO, options)
     else:
-        zero = float(np.median(y - x))
-        if name == "theta" and not turned and 1.0 / CLOSE < ratio < CLOSE and abs(zero) > OFF_ZERO:
-            return Mistake(f"it looks as if the arm hung at a reading of {zero:.2f} rad, not 0: if it does, "
-                           f"{mend(f'--zero {zero:.2f}rad')} mends it", abs(zero) > ZERO)
         return None
-    return Mistake(f"it looks as if the {NAMES[name]} {what} ({against}): {_of_unit(name, unit, turned=turned)} mends "
-                   "it", turned or (unit is not None and unit.sure))
-
-
-def _of_unit(name: str, unit: Unit | None, *, turned: bool) -> str:
-    text = OWN[name] if unit is None else unit.name
     if name == "theta":
-        return mend(*[f"--theta theta:{text}"] * (unit is not None), *["--flip"] * turned)
-    return mend(f"--{OPTIONS[name]} {name}:{'-1' * turned}{text}")
+        options = (*(f"--theta theta:{one.name}" for one in [unit] if one), *["--flip"] * turned, *options)
+    else:
+        options = (f"--{OPTIONS[name]} {name}:{'-1' * turned}{OWN[name] if unit is None else unit.name}",)
+    also = f", and as if the arm hung at a reading of {hangs}, not 0" if off else ""
+    return Mistake(f"it looks as if the {NAMES[name]} {what} ({against}){also}",
+                   turned or (unit is not None and (unit.sure or same_rig)), options)
