@@ -363,6 +363,18 @@ def test_messages_come_in_the_order_they_were_received(bags, tmp_path):
     assert plan.duration == pytest.approx(199 * 0.005)
 
 
+def test_a_long_pause_is_said_with_the_start_that_skips_it(bags, tmp_path):
+    made = commands(bags, np.arange(200) / 200, 5_000_000)
+    late = [(*one[:2], one[2] + 86_400 * 10**9 * (k >= 100), one[3]) for k, one in enumerate(made.messages)]
+    path = bags.write(tmp_path / "bag", bags.Content(late[100:] + late[:100]))
+    assert Plan(bags.write(tmp_path / "whole", made)).warning() is None
+    said = Plan(path).warning()
+    assert "pauses for 86400 s, 0 s after the start" in said
+    second = Plan(path, start=float(said.rpartition(":=")[2]))
+    assert second.warning() is None
+    assert second.end - second.start == pytest.approx(0.495e9, abs=1e6)
+
+
 def test_what_is_in_force_at_the_start_comes_first(bags, tmp_path):
     rig = bags.content(50, "/rig1")
     path = bags.write(tmp_path / "bag", rig)

@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 from rclpy.duration import Duration
@@ -38,6 +39,8 @@ from aeropend_sim.ros.worker import Worker
 
 HORIZON_NS = 1_000_000_000
 """Messages may lie in a bag this much out of order, ns."""
+PAUSE_NS = 60_000_000_000
+"""A pause that is longer is said before anything is sent, ns (choice: nobody waits so long without a word)."""
 SLEEP_S = 0.05
 """The longest the thread sleeps without looking whether it is to end, s."""
 ACKNOWLEDGE_S = 1.0
@@ -82,6 +85,7 @@ class Plan:
         connections: chosen (topic, type) -> connection.
         start: receive time of the first message played, ns.
         end: receive time of the last message played, ns.
+        pauses: receive times of the last message before each long pause and of the first one after it, ns.
     """
 
     def __init__(self, path: Path | str, topics: Iterable[str] = (), namespace: str = "", start: float = 0.0) -> None:
@@ -105,14 +109,31 @@ class Plan:
             pass  # only to learn what is in it
         chosen = self._choose()
         first, last = 2**63, -1
+        cells: dict[int, tuple[int, int]] = {}
         for connection, received, _ in self.bag.messages(lambda topic, msgtype: (topic, msgtype) in chosen):
             self.connections.setdefault((connection.topic, connection.msgtype), connection)
             first, last = min(first, received), max(last, received)
+            low, high = cells.get(received // PAUSE_NS, (received, received))
+            cells[received // PAUSE_NS] = min(low, received), max(high, received)
         if last < 0:
             raise RecordingError(f"{path}: holds no messages to replay")
         self.start, self.end = first + round(start * 1e9), last
         if self.start > self.end:
             raise RecordingError(f"{path}: start is {start:g} s, but it lasts {(last - first) / 1e9:.3f} s")
+        self._first = first
+        self.pauses = [(before, after) for (_, before), (after, _) in pairwise(cells[cell] for cell in sorted(cells))
+                       if after - before > PAUSE_NS and before >= self.start]
+
+    def warning(self) -> str | None:
+        """What to say of long pauses before anything is sent; None if there are none."""
+        if not self.pauses:
+            return None
+        before, after = self.pauses[0]
+        number = f"pauses {len(self.pauses)} times, first" if len(self.pauses) > 1 else "pauses"
+        at = (before - self.start) / 1e9
+        return (f"{self.bag.path} {number} for {(after - before) / 1e9:.0f} s, {at:.0f} s after the start, as where a "
+                "clock was set: nothing is sent meanwhile; to begin after it, give "
+                f"-p start:={(after - self._first) // 10**6 / 1e3:.3f}")
 
     @property
     def duration(self) -> float:
@@ -204,6 +225,8 @@ class Replay(Node):
             raise UserError(f"{path}: was received beyond 2038, which {CLOCK} cannot tell: leave clock out")
         for problem in self._plan.bag.problems:
             self.get_logger().warn(problem)
+        if (said := self._plan.warning()) is not None:
+            self.get_logger().warn(said)
         self._outlets: dict[tuple[str, str], Publisher] = {}
         self._duty_outlets: list[Publisher] = []
         for key, connection in self._plan.connections.items():
