@@ -188,7 +188,9 @@ def _dated(t: Floats, rows: Ints, angle: Floats, lines: Ints, lengths: Ints | No
             notes.append(f"stamps off their grid of {_short(grid.period)} by up to {_short(grid.largest)}: put on it")
         return _on(grid, t, rows, lines, notes)
     if clock == "stamps":
-        notes.append(f"stamps not evenly spaced ({_pattern(t)}): kept (as you say)")
+        near = _grid(t)
+        if near is None or near.amplitude > ON_GRID * near.period:
+            notes.append(f"stamps not evenly spaced ({_pattern(t)}): kept")
         return _on_fine(t, rows, lines, notes)
     even, how = _even(t, np.arange(len(t), dtype=float)), "an even clock"
     wanders = False
