@@ -101,6 +101,34 @@ def test_a_command_in_volts_is_the_voltage_where_the_supply_is_not_known(tmp_pat
     np.testing.assert_allclose(recording.duty, PUSH / 100, atol=1e-5)
 
 
+def test_a_single_impossible_number_is_left_out_with_a_line(tmp_path, capsys):
+    wrong = np.where(np.arange(len(LONG)) == 300, 1e300, np.radians(DRIVEN))
+    head = "t [s],angle [rad],omega [rad/s],duty\n"
+    speed = 100.0 * (PUSH > 0.0) + np.radians(DRIVEN)
+    path = put(tmp_path, head + lines(LONG, wrong, speed, PUSH / 100, form="{:.9g}"))
+    command, out = proposed(capsys, path)
+    assert "line 302, column 2 \"angle [rad]\": 1e+300 is no possible number: left out" in out
+    assert command[2:6] == ["--time", "t [s]", "--theta", "angle [rad]"]
+
+
+def test_a_constant_angle_is_said_and_no_speed_takes_its_place(tmp_path, capsys):
+    head = "t [s],angle [rad],omega [rad/s],duty\n"
+    path = put(tmp_path, head + lines(LONG, 0.0 * LONG + 0.3, DRIVEN, PUSH / 100))
+    assert main([str(path)]) == 2
+    out, _ = capsys.readouterr()
+    assert "its name says the angle, but it is 0.3 all the time: constant" in out
+    assert "--theta COLUMN:UNIT" in out
+    assert "omega [rad/s]:deg" not in out
+
+
+def test_a_recording_that_is_mended_says_nothing_of_even_stamps(tmp_path, capsys):
+    path = put(tmp_path, "t,x\n" + lines(TIME, ANGLE))
+    assert main([str(path), str(tmp_path / "bag"), *MAPPED]) == 0
+    capsys.readouterr()
+    assert main([str(tmp_path / "bag"), str(tmp_path / "new"), "--flip"]) == 0
+    assert "stamps" not in capsys.readouterr().out
+
+
 def test_a_table_of_steady_states_is_no_recording(tmp_path, capsys):
     text = "".join(f"{2.4 + 0.15 * k:.2f}\t{0.05 + 0.01 * k:.4f}\n" for k in range(17))
     assert "bench_test takes it" in refused(capsys, put(tmp_path, text))

@@ -16,6 +16,7 @@ import sys
 import warnings
 import zipfile
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import date, datetime, time, timedelta, timezone
 from pathlib import Path
 from typing import Any
@@ -53,8 +54,13 @@ HDF5 = b"\x89HDF\r\n\x1a\n"
 Arrays = dict[str, NDArray[Any]]
 
 
+FARTHEST, FEW = 1e9, 0.01
+"""Number over that below which 99 % of a column are, from which on it is no possible one, and the share of such numbers
+below which they are single ones (choices)."""
+
+
 def read(path: Path, *, sheet: str | None = None, delimiter: str | None = None, decimal: str | None = None) -> Table:
-    """Read the table of a file.
+    """Read the table of a file, without single numbers that can be none.
 
     Args:
         path: CSV, TSV, text, .xlsx, .mat, .npy or .npz.
@@ -76,17 +82,38 @@ def read(path: Path, *, sheet: str | None = None, delimiter: str | None = None, 
         if sheet is not None and kind != "xlsx":
             raise TableError(f"{path}: is no workbook: leave --sheet away")
         if kind == "text":
-            return align(text.read_text(path, delimiter, decimal))
+            return without_impossible(align(text.read_text(path, delimiter, decimal)))
         if path.stat().st_size > MOST_BYTES:
             raise TableError(f"{path}: is larger than {MOST_BYTES >> 30} GiB: split it")
         if kind == "xlsx":
-            return _workbook(path, sheet)
+            return without_impossible(_workbook(path, sheet))
         readers = {"npy": _npy, "npz": _npz, "mat": _matlab}
-        return _of_arrays(path, readers[kind](path))
+        return without_impossible(_of_arrays(path, readers[kind](path)))
     except OSError as error:
         raise TableError(f"{path}: cannot be read: {error.strerror or error}") from None
     except MemoryError:
         raise TableError(f"{path}: is too large for the memory of this machine") from None
+
+
+def without_impossible(table: Table) -> Table:
+    """A table without single numbers that are far beyond all others of their column, with a note on each column."""
+    columns, notes = list(table.columns), list(table.notes)
+    for k, column in enumerate(columns):
+        size = np.abs(column.values)
+        known = size[np.isfinite(size)]
+        if not len(known) or column.is_clock:
+            continue
+        usual = float(np.percentile(known, 100.0 * (1.0 - FEW), method="lower"))
+        wrong = np.flatnonzero(np.isfinite(size) & (size > FARTHEST * max(usual, 1.0)))
+        if not len(wrong):
+            continue
+        first = f"line {table.lines[wrong[0]]}, column {table.label(k)}: {column.values[wrong[0]]:g}"
+        more = f" (and {len(wrong) - 1} more in this column)" if len(wrong) > 1 else ""
+        notes.append(f"{first} is no possible number{more}: left out")
+        values = column.values.copy()
+        values[wrong] = np.nan
+        columns[k] = replace(column, values=values)
+    return replace(table, columns=tuple(columns), notes=tuple(notes))
 
 
 def _kind(path: Path) -> str:

@@ -128,6 +128,8 @@ def _guess(table: Table, given: Given) -> tuple[list[Guess], float]:
 
 def _nothing(one: Seen) -> Guess:
     column, named = one.column, one.meaning
+    if one.traits.constant and _is_named(one, "theta") and np.isfinite(column.values).sum() > 2:
+        return Guess(why=f"its name says the angle, but it is {np.nanmax(column.values):.6g} all the time: constant")
     if column.is_text:
         needed = named.quantity in ("time", "theta", "duty") and named.odds >= STRONG
         return Guess(named.quantity if needed else "", why=f"text: {column.complaint.split(': ', 2)[-1]}")
@@ -268,6 +270,8 @@ def _arm(table: Table, seen: list[Seen], found: list[Guess], clock: int | None, 
     for k, why in explained.why.items():
         found[k] = Guess(why=why)
     named = {k: (says(seen[k], "theta"), says(seen[k], "duty")) for k in free}
+    still = any(one.traits.constant and _is_named(one, "theta") for one in seen)
+    other = {k for k in free if _is_no_angle(seen[k]) or (still and not _is_named(seen[k], "theta"))}
     angle = {k: ANGLE[about_angle(seen[k].traits)] + follows.get(k, 0.0) for k in free}
     command = {k: COMMAND[about_angle(seen[k].traits)] + ONE_WAY * seen[k].traits.one_way + follows.get(k, 0.0)
                for k in free}
@@ -284,6 +288,8 @@ def _arm(table: Table, seen: list[Seen], found: list[Guess], clock: int | None, 
             command[k] += FOLLOWS
         else:
             angle[k] += FOLLOWS
+    for k in other:
+        angle[k] = -math.inf
     prior = COMMANDED - math.log(max(len(free) - 1, 1))
     tracked = {(k, j) for k, j in gains
                if named[j][1] <= 0.0
@@ -302,7 +308,7 @@ def _arm(table: Table, seen: list[Seen], found: list[Guess], clock: int | None, 
     if not both:
         return 0.0
     a, b = max(both, key=lambda pair: both[pair])
-    if both[a, b] < 0.0 and clock is None:
+    if both[a, b] == -math.inf or (both[a, b] < 0.0 and clock is None):
         return 0.0
     same = {k for k in free if found[k].why.startswith("the same as")}
     rivals = {pair: odds for pair, odds in both.items() if not same & set(pair) - {a, b}}
@@ -370,6 +376,16 @@ def _contradictions(seen: list[Seen], found: list[Guess], angle: dict[int, float
     elif b is not None:
         second = _also(seen, found, named, b, "duty")
     return first, second
+
+
+def _is_named(one: Seen, quantity: str) -> bool:
+    """Whether the name of a column says a quantity."""
+    return one.meaning == Meaning(quantity, STRONG)
+
+
+def _is_no_angle(one: Seen) -> bool:
+    """Whether the unit of a column is that of a speed or a current, and of no angle."""
+    return bool(_unit(one.column, "omega") or _unit(one.column, "current")) and not _unit(one.column, "theta")
 
 
 def _also(seen: list[Seen], found: list[Guess], columns: Collection[int], chosen: int, quantity: str) -> str:
