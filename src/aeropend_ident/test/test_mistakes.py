@@ -3,6 +3,7 @@
 
 import re
 import shlex
+import struct
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from aeropend_sim.model import rig
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
+JOINT = "sensor_msgs/msg/JointState"
 PERIOD_NS = round(SAMPLE_PERIOD * 1e9)
 SURE = {
     "degrees": lambda c: {"theta": np.degrees(c["theta"])},
@@ -118,6 +120,15 @@ def test_a_motor_that_runs_while_the_duty_stays_at_0_is_refused(columns):
     assert mistakes.found(c, still, SAMPLE_PERIOD, BENCH) == []
 
 
+@pytest.mark.parametrize("missing", [(), ("v_a",)])
+def test_a_duty_that_is_stamped_late_is_a_note(missing):
+    c = drawn(31, duration=20.0)
+    late = np.concatenate([np.zeros(245), c["duty"][:-245]])
+    (one,) = mistakes.found(c | {name: np.full(len(late), np.nan) for name in missing}, late, SAMPLE_PERIOD, BENCH)
+    assert not one.sure
+    assert re.search(r"best if that was 0\.(48|49|50|51|52) s earlier", one.what)
+
+
 @pytest.mark.parametrize("effect", [None, "speed_spikes", "encoder_lag", "command_delay", "angle_offset"])
 def test_a_rig_with_an_effect_has_no_mistake(effect):
     for seed in range(3):
@@ -175,3 +186,50 @@ def test_every_command_with_a_model_says_it(columns, tmp_path, monkeypatch, caps
     assert command([*words, "bag"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "bag: it looks as if the current is turned over" in line
+
+
+@pytest.mark.parametrize(("names", "options"), [
+    (("pendulum", "rotor"), "--theta pendulum:rad"),
+    (("the pole", "rotor"), "--theta 'the pole:rad'")])
+def test_an_arm_of_another_name_is_named_with_the_command_that_takes_it(columns, bags, tmp_path, names, options):
+    made = bags.content(len(columns["duty"]), columns=columns)
+    stamps, joints = made.arrays["stamp_ns"].tolist(), []
+    for k, stamp in enumerate(stamps):
+        position, speed = [float(columns["theta"][k]), np.nan], [np.nan, float(columns["omega"][k])]
+        joints.append(("/joint_states", JOINT, stamp, bags.joint(stamp, position, speed, names)))
+    bag = bags.write(tmp_path / "bag", bags.Content([*made.without("/joint_states").messages, *joints]))
+    with pytest.raises(RecordingError) as refused:
+        as_signals(read(bag), BENCH)
+    assert f"joint_states has the joint {names[0]}, none is called arm" in str(refused.value)
+    assert options in str(refused.value)
+    new = mended(str(refused.value), bag)
+    np.testing.assert_allclose(new.theta, columns["theta"])
+    np.testing.assert_allclose(new.omega, columns["omega"])
+
+
+def test_both_joints_of_other_names_can_be_taken(columns, bags, tmp_path):
+    made = bags.content(len(columns["duty"]), columns=columns)
+    joints = []
+    for k, stamp in enumerate(made.arrays["stamp_ns"].tolist()):
+        position, speed = [float(columns["theta"][k]), np.nan], [np.nan, float(columns["omega"][k])]
+        joints.append(("/joint_states", JOINT, stamp, bags.joint(stamp, position, speed, ("pole", "fan"))))
+    bag = bags.write(tmp_path / "bag", bags.Content([*made.without("/joint_states").messages, *joints]))
+    with pytest.raises(RecordingError, match=r"no arm angle: .*its joints: fan, pole.*--theta JOINT:rad` takes it"):
+        as_signals(read(bag), BENCH)
+    new = str(tmp_path / "new")
+    assert import_([str(bag), new, "--theta", "pole:rad", "--omega", "fan.velocity:rad/s"]) == 0
+    alike(read(new), columns)
+
+
+def test_stamps_in_another_unit_are_refused_with_the_command_that_mends_them(columns, bags, tmp_path):
+    made = bags.content(len(columns["duty"]), columns=columns)
+    messages = []
+    for topic, kind, received, raw in made.without("/duty_command", "/reference").messages:
+        stamp = int(made.arrays["stamp_ns"][len(messages) // 2]) // 1000
+        messages.append((topic, kind, received, raw[:4] + struct.pack("<iI", *divmod(stamp, 10**9)) + raw[12:]))
+    bag = bags.write(tmp_path / "bag", bags.Content(messages))
+    with pytest.raises(RecordingError, match="but it was received over 5") as no:
+        as_signals(read(bag), BENCH)
+    new = mended(str(no.value), bag)
+    assert new.duration == pytest.approx(read(bag).duration * 1000, rel=1e-3)
+    assert new.period == pytest.approx(SAMPLE_PERIOD, rel=0.1)

@@ -103,6 +103,23 @@ def test_without_armature_the_duty_is_the_commanded_one(bags, tmp_path):
     assert "not measured: i_a, v_a" in recording.notes
 
 
+def test_an_armature_without_duties_leaves_them_to_the_commands(bags, tmp_path):
+    made = bags.content(60, columns={"duty": np.full(60, NAN)})
+    recording = read(bags.write(tmp_path / "bag", made))
+    assert set(recording.duty[12:]) == {0.1, 0.3}
+    assert recording.channels == ("theta", "omega", "i_a", "v_a", "duty")
+    assert "no duty in armature: the duty is that of duty_command by the time it was received" in recording.notes
+
+
+def test_joints_of_other_names_are_kept_beside_ours(bags, tmp_path):
+    joints = [("/joint_states", JOINT, k, bags.joint(k, [0.1 * k, NAN], [1.0, 2.0], ["pole", "rotor"]))
+              for k in range(1, 9)]
+    recording = read(bags.write(tmp_path / "bag", bags.Content(joints)))
+    assert recording.channels == ("omega",)
+    assert list(recording.others) == ["pole", "pole.velocity"]
+    np.testing.assert_allclose(recording.others["pole"], 0.1 * np.arange(1, 9))
+
+
 @pytest.mark.parametrize(
     ("left_out", "channels"),
     [

@@ -8,6 +8,7 @@ Example:
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from aeropend_ident.bags import judging
 from aeropend_ident.bags.cdr import Block, decode
 from aeropend_ident.bags.container import Bag
-from aeropend_ident.bags.mending import named
+from aeropend_ident.bags.mending import mend, named
 from aeropend_ident.bags.reading import RecordingError
 from aeropend_sim.untrusted import printable
 from aeropend_sim.wording import counted
@@ -49,6 +50,10 @@ _TOPICS = {
     "reference": _FLOAT,
 }
 _ARM, _ROTOR = "arm", "rotor"
+_JOINTS = ("theta", "theta_dot", "omega")
+_TAKE = f"; if one is the arm, {mend('--theta JOINT:rad')} takes it"
+NO_JOINT = f"has no joint named {_ARM} or {_ROTOR}"
+"""What a note says of joints that are none of ours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +101,7 @@ class Recording:
         truth: what the plant published below truth/, if it was recorded.
         complete: whether the bag was closed and is undamaged.
         notes: what a user should know about this recording, one line each.
+        others: joints that are not ours, if they have numbers: "NAME" -> (N,) position, "NAME.velocity" -> (N,).
     """
 
     path: str
@@ -119,6 +125,7 @@ class Recording:
     truth: Truth | None
     complete: bool
     notes: tuple[str, ...]
+    others: dict[str, Floats] = dataclasses.field(default_factory=dict)
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -145,7 +152,8 @@ def read(path: Path | str, namespace: str | None = None, *, judged: bool = True)
     Args:
         path: a rosbag2 folder (metadata up to version 9) or a bare .mcap or .db3 file, broken off or not.
         namespace: the rig to read when the bag holds several: "/rig1".
-        judged: False leaves the numbers as they are recorded, for their unit to be changed.
+        judged: False leaves the numbers as they are recorded, for their unit to be changed, and joints with other names
+            for one of them to be taken.
 
     Raises:
         RecordingError: the bag cannot be used; the message is one line that says what to do.
@@ -160,7 +168,7 @@ def read(path: Path | str, namespace: str | None = None, *, judged: bool = True)
             one = series[key] = _Series(connection.topic, connection.msgtype)
         one.times.append(time)
         one.messages.append(data)
-    rigs, strange = _rigs(series, bag)
+    rigs, strange = _rigs(series, bag, others=not judged)
     found = _choose(rigs, namespace, bag)
     notes = [strange[found]] if found in strange else []
     try:
@@ -199,8 +207,14 @@ class _Series:
         self.messages: list[bytes] = []
 
 
-def _rigs(series: dict[tuple[str, str], _Series], bag: Bag) -> tuple[dict[str, dict[str, _Series]], dict[str, str]]:
+def _rigs(series: dict[tuple[str, str], _Series], bag: Bag, *, others: bool
+          ) -> tuple[dict[str, dict[str, _Series]], dict[str, str]]:
     """Sort the series into rigs: namespace -> topic -> series. A rig has an armature, or a joint named arm or rotor.
+
+    Args:
+        series: of the bag.
+        bag: the bag.
+        others: whether a rig may have joints of other names.
 
     Returns:
         The rigs, and by namespace what is to be said of joints that are none of ours.
@@ -215,14 +229,19 @@ def _rigs(series: dict[tuple[str, str], _Series], bag: Bag) -> tuple[dict[str, d
         joints = topics.get("joint_states")
         if joints is not None and (names := _other_joints(joints)) is not None:
             its = f" (its joints: {', '.join(names)})" if names else ""
-            strange[place] = f"{joints.topic} has no joint named {_ARM} or {_ROTOR}{its}"
-            del topics["joint_states"]
+            strange[place] = f"{joints.topic} {NO_JOINT}{its}"
+            if not others:
+                del topics["joint_states"]
         if not {"joint_states", "armature"} & set(topics):
             del rigs[place]
+    if others and set(rigs) - set(strange):  # joints of another robot are no rig
+        rigs = {place: topics for place, topics in rigs.items() if place not in strange or "armature" in topics}
+    if rigs and others:
+        return rigs, {}
     if rigs:
-        return rigs, {place: f"{said}: left out" for place, said in strange.items()}
+        return rigs, {place: f"{said}: left out{_TAKE}" for place, said in strange.items()}
     if strange:
-        raise RecordingError(f"{bag.path}: {'; '.join(strange.values())}")
+        raise RecordingError(f"{bag.path}: {'; '.join(strange.values())}{named(_TAKE, bag.path)}")
     if not bag.counts.total():
         why = f" ({bag.problems[0]})" if bag.problems else ""
         raise RecordingError(f"{bag.path}: holds no messages{why}")
@@ -286,12 +305,14 @@ class _Join:
         for table in (armature, joints):  # where both are there, the arrival of joint_states counts
             self.received[np.searchsorted(self.stamps, table.stamps)] = table.received
         self.columns = self._placed((armature, joints), CHANNELS)
+        self.others = self._placed((joints,), [name for name in joints.columns if name not in _JOINTS])
         if judged:
             self.columns = {name: judging.channel(name, x, notes, self.columns) for name, x in self.columns.items()}
         self.command = self._values(topics.get("duty_command"))
         self.reference = self._values(topics.get("reference"))
-        if not len(armature.stamps):
-            self._take_duty_from_command(judged=judged)
+        if not np.isfinite(self.columns["duty"]).any():
+            self._take_duty_from_command("no duty in armature" if len(armature.stamps) else "no armature",
+                                         judged=judged)
         repeated = self.duplicates
         self.truth = self._truth(topics)
         self.duplicates = repeated
@@ -307,6 +328,7 @@ class _Join:
             return
         self.stamps, self.received = stamps[rows], self.received[rows]
         self.columns = {name: x[rows] for name, x in self.columns.items()}
+        self.others = {name: x[rows] for name, x in self.others.items()}
         if self.truth is not None:
             self.truth = Truth(**{field.name: getattr(self.truth, field.name)[rows] for field in fields(Truth)})
 
@@ -342,10 +364,11 @@ class _Join:
             truth=self.truth,
             complete=complete,
             notes=tuple(self.notes),
+            others={name: x for name, x in self.others.items() if np.isfinite(x).any()},
         )
 
     def _joints(self, series: _Series) -> _Table:
-        columns = {name: np.full(len(series.messages), np.nan) for name in ("theta", "theta_dot", "omega")}
+        columns = {name: np.full(len(series.messages), np.nan) for name in _JOINTS}
         blocks = self._decode(series)
         for block in blocks:
             names = block.names.get("name", ())
@@ -357,6 +380,13 @@ class _Join:
                 values = judging.numbers(block.numbers[field])
                 if joint in names and names.index(joint) < values.shape[1]:
                     columns[column][block.rows] = values[:, names.index(joint)]
+            for k, name in enumerate(map(printable, names[:MOST_NAMES])):
+                if name in (_ARM, _ROTOR, *_JOINTS):
+                    continue
+                for column, field_ in ((name, "position"), (f"{name}.velocity", "velocity")):
+                    values = block.numbers[field_]
+                    if k < values.shape[1] and (column in columns or len(columns) < 2 * MOST_NAMES):
+                        columns.setdefault(column, np.full(len(series.messages), np.nan))[block.rows] = values[:, k]
         return self._table(series, blocks, columns)
 
     def _armature(self, series: _Series) -> _Table:
@@ -413,8 +443,8 @@ class _Join:
                 columns[name][rows] = table.columns[name][known]
         return columns
 
-    def _take_duty_from_command(self, *, judged: bool) -> None:
-        """Hold the last command the rig would have taken: finite, clamped to -1..1 if `judged`."""
+    def _take_duty_from_command(self, why: str, *, judged: bool) -> None:
+        """Hold the last command the rig would have taken: finite, clamped to -1..1 if `judged`; `why` is noted."""
         times, values = self.command
         taken = np.isfinite(values)
         if not taken.any():
@@ -424,7 +454,7 @@ class _Join:
             values = judging.clamped(values, self.notes)
         last = np.searchsorted(times, self.received, side="right") - 1
         self.columns["duty"] = np.where(last >= 0, values[last], np.nan)
-        self.notes.append("no armature: the duty is that of duty_command by the time it was received")
+        self.notes.append(f"{why}: the duty is that of duty_command by the time it was received")
 
     def _truth(self, topics: dict[str, _Series]) -> Truth | None:
         tables = []

@@ -15,9 +15,9 @@ from aeropend_ident.checkup.check import Check, error, ok, warning
 from aeropend_ident.identification import dataset
 from aeropend_ident.identification.excitation_quality import quality
 from aeropend_ident.signals import mistakes
-from aeropend_ident.signals.from_bag import as_signals, likely_mistakes
+from aeropend_ident.signals.from_bag import as_signals, likely_mistakes, no_angle
 from aeropend_ident.signals.mistakes import Mistake
-from aeropend_ident.signals.signals import STILL
+from aeropend_ident.signals.signals import MINIMUM_DURATION, STILL
 from aeropend_ident.signals.smoothing import lag
 from aeropend_sim.model.parameters import Model
 from aeropend_sim.wording import counted
@@ -69,7 +69,7 @@ def checks(path: str, model: Model, namespace: str | None = None) -> Iterator[Ch
         yield (warning if LEFT_OUT in note else ok)(path, note)
     if not read.complete:
         yield warning(path, f"it was broken off or damaged: recover {path}")
-    likely = likely_mistakes(read, model)
+    likely = likely_mistakes(read, model) if read.duration >= MINIMUM_DURATION else []
     if likely:
         yield warning(path, named(mistakes.said(likely), path))
     yield from contents(path, read, likely)
@@ -124,7 +124,7 @@ def _angle(path: str, read: Recording) -> Iterator[Check]:
     """The angle: there, in rad, from hanging, positive where the arm is lifted."""
     known = read.theta[np.isfinite(read.theta)]
     if not len(known):
-        yield error(path, "no arm angle (joint_states, position of 'arm'): nothing can be diagnosed; record it")
+        yield error(path, f"{no_angle(read)}; nothing can be diagnosed")
         return
     for one in mistakes.without_model(read.theta, read.duty, read.i_a, read.v_a):
         yield warning(path, named(mistakes.said([one]), path))

@@ -9,6 +9,7 @@ missing.
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.bags import recording
-from aeropend_ident.bags.mending import named
+from aeropend_ident.bags.mending import mend, named
 from aeropend_ident.bags.recording import Recording, RecordingError
 from aeropend_ident.signals import mistakes
 from aeropend_ident.signals.free_decay import degrees, free_decay
@@ -65,6 +66,9 @@ MOST_MISSING = 100
 MOST_PLACES = 500
 """Greatest ratio of the places of a grid to the samples on it (choice; it bounds the memory)."""
 
+AS_LONG = 1.2
+"""Ratio by which the span of stamps may miss that of the receive times (choice: a recorder may begin late)."""
+
 BACKWARDS = 0.02
 """Voltage of the other sign, over the largest, that is no drive in both directions (choice: an offset)."""
 
@@ -102,6 +106,9 @@ def as_signals(read: Recording, model: Model, held_out: float = 0.3, *, fit_nomi
         fit_nominal: whether the rig is uncalibrated.
         mounting: of the angle's sensor, if it is known; the caller applies it.
     """
+    if not np.isfinite(read.theta).any():
+        raise RecordingError(f"{read.path}: {no_angle(read)}; nothing to compare")
+    check_stamps(read)
     theta, jumps = joined_turns(read.theta)
     if jumps:
         said = f"theta jumps by a turn {counted(jumps, 'time')}, from an end of its range to the other: joined"
@@ -139,6 +146,39 @@ def checked(read: Recording, model: Model, mounting: Mounting | None = None) -> 
     if sure := [one for one in likely if one.sure]:
         raise RecordingError(f"{read.path}: {named(mistakes.said(sure), read.path)}")
     return replace(read, notes=(*read.notes, *(named(mistakes.said([one]), read.path) for one in likely)))
+
+
+def no_angle(read: Recording) -> str:
+    """Why a recording has no angle, and what to do if the arm has another name."""
+    positions = [name for name in read.others if f"{name}.velocity" in read.others or not name.endswith(".velocity")]
+    if (said := next((note for note in read.notes if recording.NO_JOINT in note), None)) is not None:
+        return f"no arm angle: {said}"
+    if not positions:
+        return "no arm angle was measured (joint_states, position of 'arm')"
+    options = [f"--theta {positions[0]}:rad"]
+    speeds = [name for name in read.others if name.endswith(".velocity") and name != f"{positions[0]}.velocity"]
+    if not np.isfinite(read.omega).any() and speeds:
+        options.append(f"--omega {speeds[0]}:rad/s")
+    names = dict.fromkeys(name.removesuffix(".velocity") for name in read.others)
+    return (f"no arm angle: joint_states has {'the joint' if len(names) == 1 else 'joints named'} {', '.join(names)}, "
+            f"none is called arm: if {positions[0]} is the arm, "
+            f"{named(mend(*(shlex.join(option.split(' ', 1)) for option in options)), read.path)} mends it")
+
+
+def check_stamps(read: Recording) -> None:
+    """Refuse a recording whose stamps are in a smaller unit, by the times at which it was received.
+
+    Raises:
+        RecordingError: they are; one line with the command that mends it.
+    """
+    received = float(np.ptp(read.received_ns)) * 1e-9
+    if not 0.0 < read.duration < MINIMUM_DURATION <= received:
+        return
+    power = round(math.log10(received / read.duration) / 3.0)
+    if power >= 1 and 1.0 / AS_LONG < received / read.duration / 1000.0**power < AS_LONG:
+        raise RecordingError(f"{read.path}: its stamps span {read.duration:.3g} s, but it was received over "
+                             f"{received:.3g} s: if the stamps are in another unit, "
+                             f"{named(mend(f'--time t:{1000**power}s'), read.path)} mends it")
 
 
 def likely_mistakes(read: Recording, model: Model, mounting: Mounting | None = None) -> list[Mistake]:
@@ -234,9 +274,6 @@ def from_uncalibrated(read: Recording, sensing: Mapping[str, float], held_out: f
     Raises:
         RecordingError: no verdict is possible; one line that says why.
     """
-    if not np.isfinite(read.theta).any():
-        raise RecordingError(f"{read.path}: no arm angle was measured (joint_states, position of 'arm'); nothing "
-                             "to compare")
     driven = np.isfinite(read.duty).any() and float(np.nanmax(np.abs(read.duty))) >= STILL
     alone = not any(np.isfinite(getattr(read, c)).any() for c in ("omega", "i_a", "v_a"))
     index, period = irregular_grid(read.stamp_ns, LONGEST_PERIOD if driven and alone else math.inf)

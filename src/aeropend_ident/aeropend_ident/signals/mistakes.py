@@ -75,10 +75,22 @@ RISES = 0.3
 Measured: of 120 rigs of the blind check the least is 0.83."""
 
 DRIVEN = 0.2
-"""Share of the voltage, or speed, of full duty by which it varies only if the duty does (choice: a supply sags less)."""
+"""Share of the voltage, or speed, of full duty by which they vary only if the duty does (choice: no supply sags so)."""
 
 STILL = 0.01
 """Width of the levels of the duty (choice)."""
+
+LATE = {"v_a": 0.1, "omega": 0.3}
+"""[s] Least time by which a reading is ahead of its simulation where the duty is late, by channel (choice: a rotor of
+another inertia is ahead too).
+
+Measured: of 72 rigs, healthy ones and one of each effect and seed, none is called late."""
+
+LATE_MOST, LATE_STEP = 2.0, 0.01
+"""[s] Greatest time that is tried, and its step (choices)."""
+
+LATE_LEFT, LATE_BETTER = 0.1, 4.0
+"""Share of the variance that may be left at the best time, and ratio by which it must be below that at 0 (choices)."""
 
 LEAST = 100
 """Readings with which a channel is compared (choice)."""
@@ -206,7 +218,7 @@ def found(readings: Mapping[str, Array], duty: Array, period: float, model: Mode
         if not any(name in two for two in twos):
             out.append(_of_channel(name, *pair, same_rig=same_rig) or (_absurd(name, *pair) if driven else None))
     if not any(out):
-        out.append(_slipped(readings["theta"], period))
+        out += [_slipped(readings["theta"], period), _late(readings, simulated, period)]
     return [one for one in out if one is not None]
 
 
@@ -276,6 +288,34 @@ def _slipped(theta: Array, period: float) -> Mistake | None:
     at = jumps[0]
     return Mistake(f"the angle jumps by {steps[at]:.2g} rad at {known[at] * period:.1f} s, faster than any arm turns: "
                    "its zero was set there, or it slipped; record again", sure=True)
+
+
+def _late(readings: Mapping[str, Array], simulated: Mapping[str, Array], period: float) -> Mistake | None:
+    """Whether the motor acts before its duty says so, which no effect does."""
+    every = max(round(LATE_STEP / period), 1)
+    most = round(LATE_MOST / (every * period))
+    for name, least in LATE.items():
+        x, y = simulated[name][::every], readings[name][::every]
+        if np.isfinite(y).sum() < LEAST or len(y) <= 2 * most:
+            continue
+        left = {k: _unexplained(x[max(k, 0):len(x) + min(k, 0)], y[max(-k, 0):len(y) - max(k, 0)])
+                for k in range(-most, most + 1)}
+        best = min(left, key=lambda k: left[k])
+        lead = best * every * period
+        if lead >= least and left[best] < LATE_LEFT and left[best] < left[0] / LATE_BETTER:
+            return Mistake(f"the {NAMES[name]} follows the duty best if that was {lead:.2f} s earlier, and no effect "
+                           "is ahead of its duty: is the duty stamped late?", sure=False)
+        return None
+    return None
+
+
+def _unexplained(x: Array, y: Array) -> float:
+    """Share of the variance of y (N,) that x (N,) does not explain; 1 if they go against each other."""
+    both = np.isfinite(x) & np.isfinite(y)
+    if both.sum() < LEAST or np.ptp(x[both]) == 0.0 or np.ptp(y[both]) == 0.0:
+        return 1.0
+    r = float(np.corrcoef(x[both], y[both])[0, 1])
+    return 1.0 - max(r, 0.0) ** 2
 
 
 def _span(x: Array) -> float:

@@ -25,7 +25,7 @@ def is_recording(path: Path) -> bool:
 
 
 def read(path: Path, namespace: str | None = None) -> Table:
-    """Read a recording as a table: t, the channels and the reference, each as it was recorded.
+    """Read a recording as a table: t, the channels, the reference and other joints, each as it was recorded.
 
     Args:
         path: a rosbag2 folder, or a bare .mcap or .db3 file.
@@ -41,6 +41,7 @@ def read(path: Path, namespace: str | None = None) -> Table:
     if len(read_.reference):
         last = np.searchsorted(read_.reference_ns, read_.received_ns, side="right") - 1
         columns["reference"] = np.where(last >= 0, read_.reference[last], np.nan)
+    columns |= {name: x for name, x in read_.others.items() if name not in columns}
     kept = {name: np.where(np.isfinite(x), x, np.nan) for name, x in columns.items()}
     return Table(path, tuple(_column(name, x) for name, x in kept.items() if np.isfinite(x).any()),
                  np.arange(1, len(read_) + 1), read_.notes)
