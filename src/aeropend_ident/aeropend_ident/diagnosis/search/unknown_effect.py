@@ -152,7 +152,9 @@ def judge(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool, sp
     worst = max(terms, key=lambda b: amount[b])
     if share(worst) > MOSTLY_LEFT:
         instead.add(worst)
-    term = _placed(chains, worst, findings[worst].base, known[worst]) if worst == "motor" else terms[worst]
+    term = terms[worst]
+    if worst == "motor" and any(key(c).recording == 0 for c, r in findings[worst].base.residuals.items() if len(r)):
+        term = _placed(chains, worst, findings[worst].base, known[worst])
     return UnknownEffect(worst, term, instead=worst in instead)
 
 
