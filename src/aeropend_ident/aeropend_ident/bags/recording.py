@@ -384,7 +384,7 @@ class _Join:
                 if name in (_ARM, _ROTOR, *_JOINTS):
                     continue
                 for column, field_ in ((name, "position"), (f"{name}.velocity", "velocity")):
-                    values = block.numbers[field_]
+                    values = judging.numbers(block.numbers[field_])
                     if k < values.shape[1] and (column in columns or len(columns) < 2 * MOST_NAMES):
                         columns.setdefault(column, np.full(len(series.messages), np.nan))[block.rows] = values[:, k]
         return self._table(series, blocks, columns)
