@@ -110,7 +110,8 @@ def answer(k: int, effect: str, form: str, seed: int, duration: float) -> Answer
     pairs = [{score.id_of(name) for name in pair} for pair in which.not_separable]
     named = {which.verdict}.union(*(pair for pair in pairs if which.verdict in pair))
     mine = next((c for c in which.candidates if c.effect == effect), None)
-    likeliest = max(mine.forms.items(), key=lambda item: item[1], default=("", 0.0)) if mine else ("", 0.0)
+    forms = (mine.forms if mine else None) or {"": 0.0}
+    likeliest = max(forms.items(), key=lambda item: item[1])
     strength, held = None, []
     if mine is not None and mine.found:
         if mine.strength is not None:

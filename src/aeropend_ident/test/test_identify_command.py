@@ -78,7 +78,7 @@ def test_bad_input_gives_one_line_and_no_numbers(bag, made, tmp_path):
         "no_such_bag": ["no_such_bag"],
         "unknown_state": [bag, "--states", "theta,phi"],
         "4.0 s": [made("short", columns(4.0))],
-        "v_a is 0": [made("still", still)],
+        "the duty stays at 0": [made("still", still)],
         "1 of": [made("holed", holed)],
         "omega was not measured": [made("no_speed", {**good, "omega": np.full_like(good["omega"], np.nan)})],
         "not understood": [bag, "--terms", "sin(theta)), theta_dot"],

@@ -189,7 +189,7 @@ def candidates(joint: JointFit, statistical: Statistical, held_out: HeldOut, gap
                 rows[h.family] = Candidate(
                     effect, h.place, r.probability, estimates, h.name in claimed, after,
                     share.get(h.name) if mine else None, since, until, _finite(r.gain), None if mine else winner,
-                    "" if effect == h.effect else h.effect, r.forms, strength)
+                    "" if effect == h.effect else h.effect, r.forms or None, strength)
     for extra in statistical.found:
         h = extra.hypothesis
         estimates = {key(n).name: interval(v, extra.fit.sd[n], 0.0) for n, v in extra.fit.values.items()}

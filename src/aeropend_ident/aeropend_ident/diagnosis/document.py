@@ -117,7 +117,7 @@ class Candidate:
         evidence: log evidence over no further effect, from the fitted part; null if it was not compared.
         behind: the hypothesis that was found in its place, "parameter_mismatch:NAME" for a parameter; null if none was.
         form: id of the form of the effect that its parameters are of; "" for the effect itself.
-        forms: [0..1] form -> probability among the forms of the effect; empty if no other form was tried.
+        forms: [0..1] form -> probability among the forms of the effect; null if no other form was tried.
         strength: RMS of its term over the fitted part, in the unit of a term at its place, of a dry friction where it
             moves; the interval is over all forms that explain the recording. Null if the term is no formula.
     """
@@ -134,7 +134,7 @@ class Candidate:
     evidence: float | None = None
     behind: str | None = None
     form: str = ""
-    forms: Mapping[str, float] = field(default_factory=dict)
+    forms: Mapping[str, float] | None = None
     strength: Interval | None = None
 
     @property

@@ -86,11 +86,17 @@ another inertia is ahead too).
 
 Measured: of 72 rigs, healthy ones and one of each effect and seed, none is called late."""
 
-LATE_MOST, LATE_STEP = 2.0, 0.01
-"""[s] Greatest time that is tried, and its step (choices)."""
+LATE_MOST = 2.0
+"""[s] Greatest time that is tried (choice)."""
 
-LATE_LEFT, LATE_BETTER = 0.1, 4.0
-"""Share of the variance that may be left at the best time, and ratio by which it must be below that at 0 (choices)."""
+LATE_STEP = 0.01
+"""[s] Step of the times that are tried (choice)."""
+
+LATE_LEFT = 0.1
+"""Share of the variance that may be left at the best time (choice)."""
+
+LATE_BETTER = 4.0
+"""Ratio by which what is left at the best time must be below that without a shift (choice)."""
 
 LEAST = 100
 """Readings with which a channel is compared (choice)."""

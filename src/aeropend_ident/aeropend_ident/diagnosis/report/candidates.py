@@ -196,7 +196,7 @@ def _row(document: DiagnosisDocument, c: Candidate) -> CandidateRow:
 
 def form_text(c: Candidate) -> str:
     """The form of an effect: `form: ground_effect_rational`, or those that the recording cannot separate."""
-    likely = {form: p for form, p in c.forms.items() if p > CALIBRATED.undecided}
+    likely = {form: p for form, p in (c.forms or {}).items() if p > CALIBRATED.undecided}
     names = [f"{form} {percent(p)}" for form, p in likely.items()]
     if len(likely) > 1:
         return f"form not separable: {', '.join(names)}"

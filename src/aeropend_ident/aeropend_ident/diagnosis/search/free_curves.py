@@ -438,22 +438,30 @@ class _System:
         stiff = np.full(len(basis), STIFF * len(r) / 1e3)
         return basis, r, size, rows, rows @ rows.T + np.diag([*np.ones(len(self.z)), *stiff])
 
-    def predicted(self, place: str, stiffness: float) -> float:
+    def predicted(self, place: str, stiffnesses: Sequence[float]) -> list[float]:
         """Mean square that curves at a place leave of each block of time if they are fitted to all others.
+
+        The normal equations of each block are formed once.
 
         Args:
             place: of the curves.
-            stiffness: weight of the prior on the curves, per row.
+            stiffnesses: weights of the prior on the curves, per row.
+
+        Returns:
+            The mean square with each of them.
         """
         basis, r = self.basis[place], self.residual
         rows = basis / np.maximum(np.sqrt(np.mean(basis**2, axis=1)), 1e-12)[:, None]
-        squares = 0.0
-        for k in range(FOLDS):
-            fitted, out = rows[:, self.fold != k], rows[:, self.fold == k]
-            information = fitted @ fitted.T + stiffness * len(r) * np.eye(len(rows))
-            solution = np.linalg.solve(information, fitted @ r[self.fold != k])
-            squares += float(np.sum((r[self.fold == k] - out.T @ solution) ** 2))
-        return squares / len(r)
+        blocks = [(rows[:, self.fold == k], r[self.fold == k]) for k in range(FOLDS)]
+        products = [(x @ x.T, x @ y) for x, y in blocks]
+        gram, moment = sum(g for g, _ in products), sum(m for _, m in products)
+        left = []
+        for stiffness in stiffnesses:
+            prior = stiffness * len(r) * np.eye(len(rows))
+            solved = [np.linalg.solve(gram - g + prior, moment - m) for g, m in products]
+            squares = [float(np.sum((y - x.T @ one) ** 2)) for (x, y), one in zip(blocks, solved, strict=True)]
+            left.append(sum(squares) / len(r))
+        return left
 
 
 def _system(chains: CutChains, stage: str, base: Mapping[str, float], known: Sequence[Parameter], *,
@@ -547,7 +555,7 @@ def repeatable(chains: CutChains, stage: str, values: Mapping[str, float]) -> Re
     whole.each = [replace(c, signals=replace(c.signals, train=len(c.signals))) for c in chains.each]
     system = _system(whole.head(MOST_SAMPLES), stage, values, [])
     before = float(np.mean(system.residual**2))
-    found = [(system.predicted(place, stiffness), place) for place in system.curves for stiffness in STIFFNESSES]
+    found = [(left, place) for place in system.curves for left in system.predicted(place, STIFFNESSES)]
     left, place = min(found)
     return Repeatable(place, min(max((before - left) / max(before - 1.0, 1e-12), 0.0), 1.0))
 

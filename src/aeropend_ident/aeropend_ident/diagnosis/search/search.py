@@ -185,7 +185,8 @@ def _select(here: SelectionRound, findings: Findings, candidates: list[Hypothesi
     tried = here.converged(tried, rounds, but=lead)
     if not policy.wide_search and not any(passes_as_noise(f, MATERIAL) for _, f in tried):
         tried = here.multi_started(tried)
-    if policy.driven and not policy.wide_search:
+    # a change keeps the form that is known; an instant is located without a form that could stand in for it
+    if policy.driven and policy.calibrated and chains.known is None and chains.recordings[0].window is None:
         tried = here.with_forms(tried)
     if not findings.found:
         tried = here.from_plain(open_, tried)
