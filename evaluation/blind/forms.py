@@ -83,7 +83,10 @@ def true_strength(case: cases.Case, sensing: Mapping[str, float], duty: Array) -
         return np.array([unit * plant.derivative(y[k], k * plant.PERIOD, duty[k], p, np.zeros(0), d)[state]
                          for k in range(end)])
 
-    term = of(with_) - of(without)
+    term = of(with_)
+    y = y.copy()
+    y[:, plant.S.sag] = 0.0  # what the supply has stored is of the effect
+    term = term - of(without)
     if id_ in ("coulomb_friction", "rotor_friction"):
         speed = np.abs(y[:end, plant.S.rate if id_ == "coulomb_friction" else plant.S.omega])
         term = term[speed > 0.02 * speed.max()]

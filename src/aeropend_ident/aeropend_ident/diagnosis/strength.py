@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis import free_run_gap
+from aeropend_ident.diagnosis.chain.priors import model_parameters
+from aeropend_ident.diagnosis.chain.values import STAGES
 from aeropend_ident.diagnosis.document import Interval
 from aeropend_ident.diagnosis.joint_fit import WIDER, JointFit
 from aeropend_ident.diagnosis.search.findings import RankedHypothesis
@@ -32,6 +34,9 @@ Array = NDArray[np.float64]
 MOVES = 0.02
 """Share of the largest speed above which a part counts as moving (choice): dry friction at rest is what holds it."""
 
+THROUGH = ("k0", "k1", "k2", "k3", "k_thrust")
+"""Parameters of the model through which a term takes voltage or thrust."""
+
 NUDGE = 0.1
 """Standard deviations by which a parameter is moved for a derivative (choice)."""
 
@@ -45,6 +50,7 @@ class Strengths:
 
     def __init__(self, joint: JointFit) -> None:
         self.joint = joint
+        self.numbers: Mapping[str, float] = {}
         self.signals = joint.chains.recordings[0].head(joint.chains.recordings[0].train)
 
     @cached_property
@@ -53,16 +59,18 @@ class Strengths:
         chains = self.joint.chains
         values = chains.values_of(self.joint.values, 0)
         run, model = free_run_gap.motion(chains.model, self.signals, values)
-        n = model.numbers()
-        return {"theta": run.theta, "theta_dot": run.theta_dot, "omega": run.omega, "i_a": run.i_a,
-                "v": np.asarray(actuator.voltage(n, self.signals.duty)),
-                "thrust": np.asarray(actuator.thrust(n, run.omega))}
+        self.numbers = model.numbers()
+        return {"theta": run.theta, "theta_dot": run.theta_dot, "omega": run.omega, "i_a": run.i_a}
 
-    def strength(self, effect: Effect, own: Mapping[str, float]) -> float:
+    def strength(self, effect: Effect, own: Mapping[str, float], numbers: Mapping[str, float]) -> float:
         """RMS of the term of an effect, in the unit of its place; of a dry friction where it moves."""
         parameters = {name: own.get(name, p.neutral) for name, p in effect.parameters.items()}
+        known = self.known
+        n = {**self.numbers, **{k: v for k, v in numbers.items() if k in self.numbers}}
+        known = {**known, "v": np.asarray(actuator.voltage(n, self.signals.duty)),
+                 "thrust": np.asarray(actuator.thrust(n, known["omega"]))}
         term = along(effect.formula, parameters, len(self.signals), self.signals.period, effect.memory, effect.rate,
-                     **self.known)
+                     **known)
         if effect.sticks:
             speed = np.abs(self.known["omega" if effect.place == "rotor" else "theta_dot"])
             term = term[speed > MOVES * speed.max()]
@@ -79,12 +87,16 @@ class Strengths:
         """
         effect, by = DEFINED[h.effect], {p.name: p for p in h.own}
         names = list(f.values)
+        # thrust and voltage depend on parameters of the model; the motion is known from the readings
+        by |= {p.name: p for stage in STAGES for p in model_parameters(self.joint.chains, stage)
+               if p.name in THROUGH and p.name in f.values}
         covariance = np.linalg.inv(f.information(f.ess))
         at = [names.index(name) for name in by]
         z = np.array([by[name].to_standard(values[name]) for name in by])
 
         def of(z: Array) -> float:
-            return self.strength(effect, {key(n).name: p.value(x) for (n, p), x in zip(by.items(), z, strict=True)})
+            now = {n: p.value(x) for (n, p), x in zip(by.items(), z, strict=True)}
+            return self.strength(effect, {key(n).name: x for n, x in now.items() if n not in THROUGH}, now)
 
         value, slope = of(z), np.zeros(len(z))
         for j in range(len(z)):
