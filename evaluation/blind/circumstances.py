@@ -398,7 +398,4 @@ def report(out: Path) -> list[score.Figure]:
         print(f"{j.label['name']} {'+' if j.first else '-'} "
               f"{j.label['row']:16} {', '.join(true[:3]) or 'nothing'} -> {j.answer.first} ({j.answer.place}): "
               f"{', '.join(said)}; {j.answer.seconds:.1f} s")
-    made = figures(found)
-    for f in made:
-        print(page.line(f.document()))
-    return made
+    return page.printed(figures(found))

@@ -155,14 +155,11 @@ def report(count: int, seed: int, duration: float, jobs: int) -> list[score.Figu
     found: list[Answer] = folder.each("diagnosing", plan(count, seed),
                                       lambda k, row: answer(k, *row, seed, duration), jobs)
     for a in found:
-        closed = "nothing to close" if a.closed is None else f"{100.0 * a.closed:.0f} % closed"
+        closed = page.closed(a.closed)
         form = f"; form {a.likeliest[0]} {100.0 * a.likeliest[1]:.0f} %" if a.likeliest[0] else ""
         if a.strength is not None:
             closed += f", strength {a.strength[0]:.3g} in {a.strength[2]:.3g} to {a.strength[3]:.3g}" + " MISSED" * (
                 not a.held)
         print(f"{'+' if a.verdict == a.effect else '-'} {a.form:6} {a.effect:21} {a.place:10} -> {a.verdict:20} "
               f"({a.said}) {', '.join(a.beside)}{form}; {closed}; {a.seconds:.1f} s")
-    made = figures(found)
-    for f in made:
-        print(page.line(f.document()))
-    return made
+    return page.printed(figures(found))

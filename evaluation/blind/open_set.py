@@ -118,11 +118,8 @@ def report(count: int, seed: int, duration: float, jobs: int) -> list[score.Figu
     found: list[Answer] = folder.each("diagnosing", plan(count, seed),
                                       lambda k, effect: answer(k, effect, seed, duration), jobs)
     for a in found:
-        closed = "nothing to close" if a.closed is None else f"{100.0 * a.closed:.0f} % closed"
+        closed = page.closed(a.closed)
         print(f"{'outside' if a.outside else 'left out'} {a.effect:20} {a.place:10} -> {a.verdict:18} ({a.said}); "
               f"{'learned; ' * a.learned}{closed}{'' if a.formula is None else f', formula {a.formula:.2f}'}; "
               f"{a.seconds:.1f} s")
-    made = figures(found)
-    for f in made:
-        print(page.line(f.document()))
-    return made
+    return page.printed(figures(found))

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from evaluation import results
+from evaluation.blind import score
 
 Figure = Mapping[str, Any]
 """A `score.Figure` as JSON."""
@@ -54,6 +55,18 @@ def line(figure: Figure) -> str:
     between = f" (95 %: {interval(figure)})" if interval(figure) else ""
     goal = f", {target(figure)}: {'met' if figure['met'] else 'MISSED'}" if target(figure) else ""
     return f"{figure['name']}: {value(figure)}{between} of {figure['count']}{goal}"
+
+
+def printed(figures: list[score.Figure]) -> list[score.Figure]:
+    """The figures, after each was printed in a line."""
+    for f in figures:
+        print(line(f.document()))
+    return figures
+
+
+def closed(share: float | None) -> str:
+    """How much of the closable gap closes; None if there was nothing to close."""
+    return "nothing to close" if share is None else f"{100.0 * share:.0f} % closed"
 
 
 def table(document: results.Document) -> str:

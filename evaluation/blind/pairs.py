@@ -217,10 +217,7 @@ def report(count: int, seed: int, duration: float, jobs: int) -> list[score.Figu
         if not j.named or j.ghosts or not all(j.held):
             true = ", ".join(f"{n} {a:.3g} -> {b:.3g}" for n, (a, b) in changed.items())
             print(f"  {j.kind}: {true or 'nothing'}; said: {', '.join(j.said) or 'nothing'}")
-    made = figures(judged)
-    for f in made:
-        print(page.line(f.document()))
-    return made
+    return page.printed(figures(judged))
 
 
 def figures(judged: Sequence[Judged]) -> list[score.Figure]:

@@ -224,7 +224,4 @@ def report(out: Path) -> list[score.Figure]:
     Raises:
         SystemExit: a verdict is missing.
     """
-    found = figures(*folder.opened(out))
-    for f in found:
-        print(page.line(f.document()))
-    return found
+    return page.printed(figures(*folder.opened(out)))

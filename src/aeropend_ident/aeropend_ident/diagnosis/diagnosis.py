@@ -247,7 +247,7 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     if found.unknown is not None and not _repeats(parts, settings.material):
         found = replace(found, unknown=None)
         parts = _parts(found, joint, gaps, settings.jobs)
-    known = found, joint, gaps, parts
+    before, gap_before = (found, joint, gaps, parts), gaps.after.total
     if found.unknown is not None and _approximated(found.unknown, joint, gaps, parts):
         stage = found.unknown.stage
         stages = {**found.stages, stage: found.stages[stage].nothing()}
@@ -256,8 +256,8 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     if found.unknown is not None and gap_share.headline(
             parts, gap_share.shares(parts), settings.material).verdict == gap_share.UNKNOWN:
         found, joint, gaps, parts = _with_learned_term(fitted, found, joint, gaps, parts, settings, progress)
-    if known[0].stages is not found.stages and known[2].after.total <= gaps.after.total:
-        found, joint, gaps, parts = known  # what was taken back predicts as well as what can be learned in its place
+    if found.stages is not before[0].stages and gap_before <= gaps.after.total:
+        found, joint, gaps, parts = before  # what was taken back predicts as well as what can be learned in its place
     conclusions = _conclude(found, joint, gaps, parts, settings)
     model, chains = found.chains.model, found.chains
     nominal = model if chains.policy.calibrated else with_values(model, of_rig(gaps.base))

@@ -25,8 +25,9 @@ from aeropend_ident.diagnosis.search.selection import plausible
 from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.statistics import Z95, rms
-from aeropend_sim.model import actuator
+from aeropend_sim.model import actuator, dynamics
 from aeropend_sim.model.effects import DEFINED, Effect
+from aeropend_sim.model.parameters import Model
 from aeropend_sim.model.terms import along
 
 Array = NDArray[np.float64]
@@ -50,29 +51,25 @@ class Strengths:
 
     def __init__(self, joint: JointFit) -> None:
         self.joint = joint
-        self.numbers: Mapping[str, float] = {}
         self.signals = joint.chains.recordings[0].head(joint.chains.recordings[0].train)
 
     @cached_property
-    def known(self) -> dict[str, Array]:
-        """The quantities that terms take, (N,) each."""
+    def motion(self) -> tuple[dynamics.Trajectory, Model]:
+        """The free run of the augmented model, and that model."""
         chains = self.joint.chains
-        values = chains.values_of(self.joint.values, 0)
-        run, model = free_run_gap.motion(chains.model, self.signals, values)
-        self.numbers = model.numbers()
-        return {"theta": run.theta, "theta_dot": run.theta_dot, "omega": run.omega, "i_a": run.i_a}
+        return free_run_gap.motion(chains.model, self.signals, chains.values_of(self.joint.values, 0))
 
     def strength(self, effect: Effect, own: Mapping[str, float], numbers: Mapping[str, float]) -> float:
         """RMS of the term of an effect, in the unit of its place; of a dry friction where it moves."""
         parameters = {name: own.get(name, p.neutral) for name, p in effect.parameters.items()}
-        known = self.known
-        n = {**self.numbers, **{k: v for k, v in numbers.items() if k in self.numbers}}
-        known = {**known, "v": np.asarray(actuator.voltage(n, self.signals.duty)),
-                 "thrust": np.asarray(actuator.thrust(n, known["omega"]))}
+        run, model = self.motion
+        n = {**model.numbers(), **numbers}
         term = along(effect.formula, parameters, len(self.signals), self.signals.period, effect.memory, effect.rate,
-                     **known)
+                     theta=run.theta, theta_dot=run.theta_dot, omega=run.omega, i_a=run.i_a,
+                     v=np.asarray(actuator.voltage(n, self.signals.duty)),
+                     thrust=np.asarray(actuator.thrust(n, run.omega)))
         if effect.sticks:
-            speed = np.abs(self.known["omega" if effect.place == "rotor" else "theta_dot"])
+            speed = np.abs(run.omega if effect.place == "rotor" else run.theta_dot)
             term = term[speed > MOVES * speed.max()]
         return rms(term) if len(term) else 0.0
 
@@ -96,7 +93,8 @@ class Strengths:
 
         def of(z: Array) -> float:
             now = {n: p.value(x) for (n, p), x in zip(by.items(), z, strict=True)}
-            return self.strength(effect, {key(n).name: x for n, x in now.items() if n not in THROUGH}, now)
+            return self.strength(effect, {key(n).name: x for n, x in now.items() if n not in THROUGH},
+                                 {n: x for n, x in now.items() if n in THROUGH})
 
         value, slope = of(z), np.zeros(len(z))
         for j in range(len(z)):

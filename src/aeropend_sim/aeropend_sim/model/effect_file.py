@@ -34,6 +34,9 @@ MOST_EFFECTS = 50
 MOST_PARAMETERS = 60
 """Greatest number of parameters of an effect. A choice: a learned term has up to 44."""
 
+BUILT_IN = CATALOGUE.keys() | FORMS.keys()
+"""Ids that no file may define."""
+
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,39}")
 _KEYS = ("place", "physics", "form_of", "term", "sticks", "reading", "memory", "parameters")
 _PARAMETER_KEYS = ("unit", "neutral", "default", "low", "high", "description", "refines")
@@ -119,14 +122,14 @@ def unit_of(place: str, reading: str = "") -> str:
 
 def forget(id_: str) -> None:
     """Make an effect by formula unknown again, of which no model is left."""
-    if id_ not in CATALOGUE and id_ not in FORMS:
+    if id_ not in BUILT_IN:
         DEFINED.pop(id_, None)
 
 
 def definitions(ids: object) -> dict[str, dict[str, object]]:
     """The definitions of those effects among some ids that are given by a formula; the inverse of `define`."""
     return {effect.id: _written(effect) for id_ in ids  # type: ignore[attr-defined]
-            if id_ not in FORMS and (effect := DEFINED.get(id_)) is not None and effect.term}
+            if id_ not in BUILT_IN and (effect := DEFINED.get(id_)) is not None and effect.term}
 
 
 def _written(effect: Effect) -> dict[str, object]:
@@ -150,7 +153,7 @@ def _effect(id_: str, tree: object, where: str) -> Effect:
     at = f"{where}: {one_line(id_)}"
     if not _NAME.fullmatch(id_) or id_ in ("initial", "sensing", "model"):
         raise EffectError(f"{at}: not an id; use letters, digits and _, a letter first")
-    if id_ in CATALOGUE or id_ in FORMS or id_ == PARAMETER_MISMATCH:
+    if id_ in BUILT_IN or id_ == PARAMETER_MISMATCH:
         raise EffectError(f"{at}: an effect of the catalogue has this id; choose another one")
     if not isinstance(tree, Mapping):
         raise EffectError(f"{at}: give place, physics, term and parameters")

@@ -85,7 +85,6 @@ class Memory(NamedTuple):
 ScalarOrArray = TypeVar("ScalarOrArray", float, Array)
 
 
-
 def readings_with_errors(model: Model) -> set[str]:
     """The readings that effects by formula add errors to."""
     return {e.reading for id_ in model.effects if (e := DEFINED.get(id_)) is not None and e.term and e.reading}

@@ -150,14 +150,11 @@ def other_forms(h: Hypothesis, chains: CutChains) -> list[Hypothesis]:
     for effect in (DEFINED[id_] for id_ in (*FORMS, *chains.further)):
         if effect.form_of != h.effect or effect.id in chains.left_out:
             continue
-        own = [_somewhere(f"{effect.id}.{name}", p, math.nan) for name, p in effect.parameters.items() if not p.refines]
-        size = effect.parameters[effect.size]
-        step = usual_size(effect.id, model) - size.neutral
-        head = Parameter(own[0].name, size.neutral, SIZE_SD * abs(step), size.low, size.high)
+        others = [_somewhere(f"{effect.id}.{name}", p, math.nan) for name, p in effect.parameters.items()
+                  if name != effect.size and not p.refines]
         # a size that the effect itself does not have is not known from it
-        sizes = (FIRST_SIZE,) if key(head.name).name in {key(p.name).name for p in h.own} else SIZES
-        forms.append(Hypothesis(effect.id, starts=tuple(
-            (replace(head, start=size.neutral + share * step), *own[1:]) for share in sizes)))
+        sizes = (FIRST_SIZE,) if effect.size in {key(p.name).name for p in h.own} else SIZES
+        forms.append(Hypothesis(effect.id, starts=tuple((_size(effect.id, model, x), *others) for x in sizes)))
     return forms
 
 
@@ -204,12 +201,9 @@ def _changes(model: Model, known: Known) -> Iterable[Hypothesis]:
 def _starts(id_: str, model: Model) -> Iterable[tuple[Parameter, ...]]:
     """Start points for an effect: a third of its usual size, each other parameter at several places of its range."""
     effect = DEFINED[id_]
-    size = effect.parameters[effect.size]
-    step = usual_size(id_, model) - size.neutral
-    head = Parameter(f"{id_}.{effect.size}", size.neutral, SIZE_SD * abs(step), size.low, size.high,
-                     start=size.neutral + FIRST_SIZE * step)
+    head = _size(id_, model, FIRST_SIZE)
     if id_ in STICKING:
-        return [(head,), (replace(head, start=size.neutral + SMALLER * FIRST_SIZE * step),)]
+        return [(head,), (_size(id_, model, SMALLER * FIRST_SIZE),)]
     others = [(name, p) for name, p in effect.parameters.items() if name != effect.size and not p.refines]
     if not others:
         return [(head,)]
@@ -228,6 +222,14 @@ def _starts(id_: str, model: Model) -> Iterable[tuple[Parameter, ...]]:
             grids.append([Parameter(full, middle, half, p.low, p.high, middle + f * half) for f in (-0.6, 0.05, 0.65)])
     # the second parameter is searched; a third starts in its middle
     return [(head, first, *(g[len(g) // 2] for g in grids[1:])) for first in grids[0]]
+
+
+def _size(id_: str, model: Model, share: float) -> Parameter:
+    """The size of an effect, with a start at a share of its usual size."""
+    size = DEFINED[id_].parameters[DEFINED[id_].size]
+    step = usual_size(id_, model) - size.neutral
+    return Parameter(f"{id_}.{DEFINED[id_].size}", size.neutral, SIZE_SD * abs(step), size.low, size.high,
+                     start=size.neutral + share * step)
 
 
 def _scattered(id_: str, head: Parameter, others: Sequence[tuple[str, EffectParameter]]
