@@ -50,24 +50,44 @@ RESOLUTION, JITTER = (0.7, 1.3), 0.1
 """Resolutions and tick over those of the model file, and sample instants off by up to so many periods, if nothing is
 missing."""
 
+ROUNDED = 1e-9
+"""Room of a number beyond its tolerance, relative: a number at its end is not outside by rounding (choice)."""
+
 RANDOM_OR_STEPPED = ("command_delay", "speed_spikes", "current_clip", "slew_limit", "brown_outs")
 """Effects whose gap does not grow in proportion to their size: they are no imperfections of a messy rig."""
 
 
 class Weighed(cases.Sizer):
-    """A rig whose effects are weighed by the gap that they leave after a refit of the numbers."""
+    """A rig whose effects are weighed by the gap that they leave after a refit of the numbers of the model file.
 
-    def rest(self, p: Array, gusts: Array) -> Array:
-        """What no refit of the numbers absorbs, (4, N), each channel in floors."""
+    Each number stays within `cases.OFF` of that in the model file, from which the rig's own may differ as much.
+    """
+
+    def __init__(self, numbers: Mapping[str, float], nominal: Mapping[str, float], sensing: Mapping[str, float],
+                 duty: Array) -> None:
+        super().__init__(numbers, sensing, duty)
+        off = np.array([nominal[n] / numbers[n] for n in cases.NUMBERS if numbers[n] != 0.0])
+        self.room = off * (1.0 - cases.OFF) - 1.0 - ROUNDED, off * (1.0 + cases.OFF) - 1.0 + ROUNDED
+
+    def moved(self, p: Array, gusts: Array) -> Array:
+        """What effects change of the readings, all channels as one vector, in floors."""
         y, v, _ = plant.states(p, self.duty, gusts)
-        moved = self.stack(plant.shown(p, y, v)) - self.base
-        refit = lsq_linear(self.r, self.q.T @ moved, (-cases.OFF, cases.OFF)).x
+        return self.stack(plant.shown(p, y, v)) - self.base
+
+    def rest(self, moved: Array) -> Array:
+        """What no refit of the numbers absorbs, (4, N), each channel in floors."""
+        refit = lsq_linear(self.r, self.q.T @ moved, self.room).x
         return (moved - self.q @ (self.r @ refit)).reshape(len(self.floor), -1)
 
-    def gap(self, rest: Array) -> Array:
-        """The same over the spread of each channel: the mean square of all is the squared gap."""
+    def gap(self, moved: Array) -> float:
+        """The mean square of that over the spread of each channel, of all channels: the squared gap."""
         spread = np.std(self.base.reshape(len(self.floor), -1), axis=1)
-        return rest / spread[:, None]
+        return float(np.mean((self.rest(moved) / spread[:, None]) ** 2))
+
+    def shares(self, drawn: Sequence[Drawn]) -> dict[str, float]:
+        """Effect -> share of the squared gap that a rig without it would not have."""
+        total = np.sum([d.moved for d in drawn], axis=0)
+        return {d.effect: 1.0 - self.gap(total - d.moved) / self.gap(total) for d in drawn}
 
 
 @dataclass(frozen=True)
@@ -79,14 +99,14 @@ class Drawn:
         place: of the chain.
         parameters: by name; of an effect outside of the catalogue its size.
         gusts: (N + 2,) random torque, or (0,).
-        rest: (4, N) what it alone leaves, in floors.
+        moved: (4 N,) what it alone changes of the readings, in floors.
     """
 
     effect: str
     place: str
     parameters: dict[str, float]
     gusts: Array
-    rest: Array
+    moved: Array
 
     def scaled(self, rig: Weighed, factor: float, most: float = LARGEST) -> Drawn:
         """The effect at another size, at most one that a rig might have."""
@@ -95,7 +115,7 @@ class Drawn:
         factor = min(factor, most * abs(start) / max(abs(own[head] - neutral), 1e-12))
         own[head] = neutral + factor * (own[head] - neutral)
         gusts = factor * self.gusts
-        return Drawn(self.effect, self.place, own, gusts, rig.rest(_packed(rig, [(self.effect, own)]), gusts))
+        return Drawn(self.effect, self.place, own, gusts, rig.moved(_packed(rig, [(self.effect, own)]), gusts))
 
 
 def _packed(rig: Weighed, effects: Sequence[tuple[str, Mapping[str, float]]]) -> Array:
@@ -111,52 +131,43 @@ def small(effect: str, rig: Weighed, rng: np.random.Generator) -> Drawn:
     if effect == "gust":
         gusts = plant.turbulence(own["sigma"], own["tau"], len(rig.duty), True, rng)
     place = OUTSIDE[effect][0] if effect in OUTSIDE else cases.PLACES[effect]
-    drawn = Drawn(effect, place, own, gusts, rig.rest(_packed(rig, [(effect, own)]), gusts))
+    drawn = Drawn(effect, place, own, gusts, rig.moved(_packed(rig, [(effect, own)]), gusts))
     goal = math.exp(rng.uniform(*np.log(SMALL)))
-    return drawn.scaled(rig, goal / max(_floors(drawn.rest), 1e-3), LARGEST_SMALL)
+    return drawn.scaled(rig, goal / max(_floors(rig.rest(drawn.moved)), 1e-3), LARGEST_SMALL)
 
 
 def _floors(rest: Array) -> float:
     return float(np.sqrt(np.mean(rest**2, axis=1)).max())
 
 
-def messy(rng: np.random.Generator, numbers: Mapping[str, float], sensing: Mapping[str, float], duty: Array
-          ) -> tuple[list[Drawn], dict[str, float]]:
+def messy(rng: np.random.Generator, rig: Weighed) -> tuple[list[Drawn], dict[str, float]]:
     """A rig with many small imperfections and one main effect; and the share of each in the gap."""
-    rig = Weighed(numbers, sensing, duty)
     kinds = [e for e in (*EFFECTS, *OUTSIDE) if e not in RANDOM_OR_STEPPED]
     mains = [e for e in EFFECTS if e not in RANDOM_OR_STEPPED]
     while True:
         main = str(rng.choice(mains))
         others = [str(e) for e in rng.permutation([e for e in kinds if e != main])]
         background = [small(e, rig, rng) for e in others[:rng.integers(BACKGROUND[0], BACKGROUND[1] + 1)]]
-        behind = np.sum([rig.gap(d.rest) for d in background], axis=0)
+        behind = rig.gap(np.sum([d.moved for d in background], axis=0))
         goal = rng.uniform(*MAIN_SHARE)
         one = small(main, rig, rng)
         for _ in range(4):  # the gap of an effect grows about with its size
-            amount = float(np.mean(rig.gap(one.rest) ** 2)) / float(np.mean(behind**2))
-            one = one.scaled(rig, math.sqrt(goal / (1.0 - goal) / max(amount, 1e-6)))
+            one = one.scaled(rig, math.sqrt(goal / (1.0 - goal) / max(rig.gap(one.moved) / behind, 1e-6)))
         all_ = [one, *background]
-        total = np.sum([rig.gap(d.rest) for d in all_], axis=0)
-        shares = {d.effect: 1.0 - float(np.mean((total - rig.gap(d.rest)) ** 2) / np.mean(total**2)) for d in all_}
+        shares = rig.shares(all_)
         if shares[main] > MAIN_SHARE[0] and all(shares[main] > shares[d.effect] for d in background):
             return all_, shares
 
 
-def three(effects: Sequence[str], rng: np.random.Generator, numbers: Mapping[str, float],
-          sensing: Mapping[str, float], duty: Array) -> tuple[list[Drawn], dict[str, float]]:
+def three(effects: Sequence[str], rng: np.random.Generator, rig: Weighed) -> tuple[list[Drawn], dict[str, float]]:
     """A rig with effects that make comparable parts of the gap; and the share of each."""
-    rig = Weighed(numbers, sensing, duty)
     drawn = [small(e, rig, rng) for e in effects]
     for k, d in enumerate(drawn):
         goal = rng.uniform(*PART_OF_THREE)
         for _ in range(4):
-            amount = float(np.mean(rig.gap(d.rest) ** 2))
-            d = d.scaled(rig, goal / max(math.sqrt(amount), 1e-6))
+            d = d.scaled(rig, goal / max(math.sqrt(rig.gap(d.moved)), 1e-6))
         drawn[k] = d
-    total = np.sum([rig.gap(d.rest) for d in drawn], axis=0)
-    shares = {d.effect: 1.0 - float(np.mean((total - rig.gap(d.rest)) ** 2) / np.mean(total**2)) for d in drawn}
-    return drawn, shares
+    return drawn, rig.shares(drawn)
 
 
 def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing: Mapping[str, float], seed: int,
@@ -185,9 +196,9 @@ def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing
         return {**label, "effects": [entry]}, {**columns, "duty": duty}, lost
     controller, gusts, other = None, np.zeros(0), True
     if row in {"messy", "three effects"}:
-        drawn, label["shares"] = (messy(rng, numbers, sensing, duty) if row == "messy" else
-                                  three(effects, rng, numbers, sensing, duty))
-        p = _packed(Weighed(numbers, sensing, duty), [(d.effect, d.parameters) for d in drawn])
+        weighed = Weighed(numbers, nominal, sensing, duty)
+        drawn, label["shares"] = messy(rng, weighed) if row == "messy" else three(effects, rng, weighed)
+        p = _packed(weighed, [(d.effect, d.parameters) for d in drawn])
         gusts = next((d.gusts for d in drawn if len(d.gusts)), gusts)
         label["effects"] = [{"effect": d.effect, "place": d.place, "parameters": d.parameters} for d in drawn]
     else:

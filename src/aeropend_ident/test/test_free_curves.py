@@ -146,7 +146,7 @@ def test_arm_answers_a_small_torque_as_the_simulation_does():
     heavier = model.with_effects({"cable_torque": {"k": small, "theta0": 0.0}})
     out = np.empty((2, 2, 2000))
     for k, m in enumerate((model, heavier)):
-        run_arm(speed, State(omega=150.0, thrust=BENCH.model["k_thrust"] * 150.0**2), *prepare(m), out[k])
+        run_arm(speed, State(omega=150.0, thrust=BENCH.model["k_thrust"] * 150.0**2), 1, *prepare(m), out[k])
     theta = out[0, 0]
     n = model.numbers()
     answer = arm_response(-small * theta[None, :], n["mgd_over_J"] * np.cos(theta), n["c_over_J"], 0.0, SAMPLE_PERIOD)

@@ -44,7 +44,7 @@ def let_go(seconds, effects=None, gravity=40.0, damping=0.4, first=1.0, rate=20.
     every = 5
     n = round((seconds - held) * rate) * every + 1
     out = np.empty((2, n))
-    dynamics.run_arm(np.zeros(n), dynamics.State(theta=first), *dynamics.prepare(model, 1.0 / rate / every), out)
+    dynamics.run_arm(np.zeros(n), dynamics.State(theta=first), 1, *dynamics.prepare(model, 1.0 / rate / every), out)
     theta = np.concatenate([np.full(round(held * rate), first), out[0, ::every]]) + zero
     theta = theta + 0.2 * lsb * np.random.default_rng(seed).standard_normal(len(theta))
     return np.arange(len(theta)) / rate, np.round(theta / lsb) * lsb if lsb else theta

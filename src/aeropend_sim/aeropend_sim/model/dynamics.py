@@ -57,6 +57,9 @@ BRUSH_CURRENT = 0.02
 LONGEST_STEP = 2.5e-3
 """[s] Longest step. Measured: over a longer one the error exceeds 2e-5 of the range of each state of `bench`."""
 
+LONGEST_ARM_STEP = 10e-3
+"""[s] Longest step of the arm alone. Measured: the angle of `bench` then changes by at most 1e-5 of its range."""
+
 SAMPLED = 64
 """Points at which the slopes of terms by formula are sampled. A choice."""
 
@@ -848,33 +851,44 @@ def steady(model: Model, duty: float) -> State:
 def steps_in(model: Model, period: float) -> int:
     """Number of steps of a hold: 1 at the rig's period, unless the plant is much faster than `bench`.
 
-    The rates below are those of the fastest motions. The factors (0.04, 0.02, 0.1, 0.3) are choices; the tests compare
-    the result with scipy's integrators for fast plants.
-
     Args:
         model: parameters and effects.
         period: [s] length of the hold.
     """
+    motor, arm_ = _rates(model, period)
+    return min(MOST_STEPS, math.ceil(period * max(1.0 / LONGEST_STEP, motor, arm_) - 1e-9))
+
+
+def _rates(model: Model, period: float) -> tuple[float, float]:
+    """[1/s] Number of steps in a second that the motor and the arm need, by the rates of their fastest motions.
+
+    The factors (0.04, 0.02, 0.1, 0.3) are choices; the tests compare the result with scipy's integrators for fast
+    plants.
+    """
     n, e, added = model.numbers(), values(model.effects), terms(model.effects)
     top_speed = float(actuator.voltage(n, 1.0)) / n["K_e"]  # rad/s, never reached
     back = n["K_t"] * n["K_e"] / (n["J_m"] * n["L_a"])  # 1/s²: the speed acts back on itself through the winding
-    rates = [1.0 / LONGEST_STEP,
-             min(math.sqrt(back / 0.04), back * n["L_a"] / (0.02 * n["R_a"])),
-             2.0 * n["k_load"] * top_speed / n["J_m"] / 0.1,
-             math.sqrt(n["mgd_over_J"]) / 0.3, n["c_over_J"] / 0.3]
+    motor = [min(math.sqrt(back / 0.04), back * n["L_a"] / (0.02 * n["R_a"])),
+             2.0 * n["k_load"] * top_speed / n["J_m"] / 0.1]
+    arm_ = [math.sqrt(n["mgd_over_J"]) / 0.3, n["c_over_J"] / 0.3]
     if e is not None:
         free = 1.0 - e.mast_flex_coupling
         top_thrust = n["k_thrust"] * THRUST_PIVOT_SPEED**2 * (top_speed / THRUST_PIVOT_SPEED)**e.thrust_exponent_n
         top_drive = n["mgd_over_J"] + n["L_over_J"] * top_thrust * (1.0 + max(0.0, e.ground_effect_gain))
         damping = (n["c_over_J"] + n["L_over_J"] * e.axial_inflow_k * top_speed
                    + 2.0 * math.sqrt(e.quadratic_drag_k * (top_drive + 4.0 * e.gust_sigma)))  # at terminal speed
-        rates += [math.sqrt((n["mgd_over_J"] + abs(e.cable_torque_k)) / free) / 0.3, damping / free / 0.3]
+        arm_ += [math.sqrt((n["mgd_over_J"] + abs(e.cable_torque_k)) / free) / 0.3, damping / free / 0.3]
+        if e.coulomb_friction_accel > 0.0:  # a step is cut once where the motion reverses
+            arm_.append(1.0 / LONGEST_STEP)
         if e.mast_flex_coupling > 0.0:
-            rates += [e.mast_flex_omega / math.sqrt(free) / 0.3,
-                      2.0 * e.mast_flex_zeta * e.mast_flex_omega / free / 0.3]
+            arm_ += [e.mast_flex_omega / math.sqrt(free) / 0.3,
+                     2.0 * e.mast_flex_zeta * e.mast_flex_omega / free / 0.3]
     if added is not None:
-        rates += [min(rate / 0.3, MOST_TERM_STEPS / period) for rate in term_rates(n, top_speed, added)]
-    return min(MOST_STEPS, math.ceil(period * max(rates) - 1e-9))
+        most = MOST_TERM_STEPS / period
+        rate, angle, rotor_ = (min(x / 0.3, most) for x in term_rates(n, top_speed, added))
+        motor.append(rotor_)
+        arm_ += [rate, angle, 1.0 / LONGEST_STEP if added.arm_friction > added.rotor_friction else 0.0]
+    return max(motor), max(arm_)
 
 
 @njit()
@@ -929,11 +943,15 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0
         The coefficients, the effects, the coefficients of the effects, and their terms by formula. What the model does
         not need is None.
     """
+    return _prepared(model, period, steps or steps_in(model, period))
+
+
+def _prepared(model: Model, period: float, steps: int
+              ) -> tuple[Coefficients, Values | None, Extra | None, Terms | None]:
     n = model.numbers()
     e, added = values(model.effects), terms(model.effects)
     if e is None and added is not None:
         e = NO_EFFECT
-    steps = steps or steps_in(model, period)
     h = period / steps
     resistance = n["R_a"] + (e.supply_sag_r_supply if e else 0.0)
     c = Coefficients(steps, h, lag(resistance / n["L_a"], h), lag(n["B_m"] / n["J_m"], h), 1.0 / n["L_a"],
@@ -1037,37 +1055,81 @@ def run(v: Array, noise: Array, state: State, c: Coefficients, e: Values | None,
     return state
 
 
+def swing(model: Model, speed: Array, state: State, period: float = SAMPLE_PERIOD) -> tuple[Array, Array, State]:
+    """Air and arm alone, for a given speed of the rotor, linear between samples.
+
+    The arm is slow: a step may be longer than a sample.
+
+    Args:
+        model: parameters and effects.
+        speed: (N,) [rad/s] speed at the samples.
+        state: at the first sample.
+        period: [s] time between samples.
+
+    Returns:
+        θ and θ̇ (N,) at the samples, and the state after the last one.
+    """
+    rate = max(_rates(model, period)[1], 1.0 / LONGEST_ARM_STEP)
+    out = np.empty((2, len(speed)))
+    every, done = math.floor(1.0 / (period * rate) + 1e-9), 0
+    if every > 1:
+        done = (len(speed) - 1) // every * every
+        state = run_arm(speed[:done + 1], state, every, *_prepared(model, every * period, 1), out[:, :done])
+    steps = min(MOST_STEPS, math.ceil(period * rate - 1e-9))
+    state = run_arm(speed[done:], state, 1, *_prepared(model, period, steps), out[:, done:])
+    return out[0], out[1], state
+
+
 @njit(nogil=True)
-def run_arm(speed: Array, state: State, c: Coefficients, e: Values | None, x: Extra | None, added: Terms | None,
-            out: Array) -> State:
+def run_arm(speed: Array, state: State, every: int, c: Coefficients, e: Values | None, x: Extra | None,
+            added: Terms | None, out: Array) -> State:
     """Air and arm alone, for a given speed of the rotor, linear between samples.
 
     Args:
         speed: (N,) [rad/s] speed at the samples.
         state: at the first sample.
+        every: samples in a hold of `c`. If 1, the speed is held after the last sample.
         c: coefficients.
         e: effects; None for the nominal plant.
         x: coefficients of the effects; None for the nominal plant.
         added: terms by formula; None without any.
-        out: (2, N), filled with θ, θ̇.
+        out: (2, M), filled with θ, θ̇: at N samples, or, if `every` is greater than 1, at N - 1, a multiple of it.
 
     Returns:
-        The state after the last sample.
+        The state after the last sample of `out`.
     """
-    for k in range(speed.shape[0]):
-        out[0, k], out[1, k] = state.theta, state.theta_dot
-        w = speed[k]
-        rise = (speed[min(k + 1, speed.shape[0] - 1)] - w) / c.steps
+    last = speed.shape[0] - 1
+    for k in range(0, out.shape[1], every):
+        before, w = state, speed[k]
+        rise = (speed[min(k + every, last)] - w) / c.steps
+        middle = 0.5 * rise
+        if every > 1:  # the middle at which a parabola has the mean of the speed
+            mean = 0.5 * (speed[k] + speed[k + every])
+            for j in range(1, every):
+                mean += speed[k + j]
+            middle = 0.25 * (6.0 * mean / every - speed[k + every] - 5.0 * w)
         for _ in range(c.steps):
             now = State(0.0, w, 0.0, state.theta, state.theta_dot, state.thrust, 0.0, state.flex, state.flex_dot, 0.0,
                         state.time, state.memory)
             past = None if added is None else pasts(now, 0.0, c, added)
-            m, f1 = advance_arm(now, w + 0.5 * rise, w + rise, past, c, e, x, added)
+            m, f1 = advance_arm(now, w + middle, w + rise, past, c, e, x, added)
             w += rise
             state = State(0.0, w, 0.0, m.theta, m.theta_dot, f1, 0.0, m.flex, m.flex_dot, 0.0, now.time, now.memory)
             if added is not None and past is not None:
                 state = since(state, past_after(now, state, 0.0, past, c, added))
+        out[0, k], out[1, k] = before.theta, before.theta_dot
+        for j in range(1, every):
+            out[0, k + j], out[1, k + j] = between(before, state, j / every, c.h)
     return state
+
+
+@equation
+def between(a: State, b: State, s: float, h: float) -> tuple[float, float]:
+    """θ and θ̇ at a part s of a step of h seconds, by the cubic that has both at its ends."""
+    moved = b.theta - a.theta
+    c2, c3 = 3.0 * moved - h * (2.0 * a.theta_dot + b.theta_dot), h * (a.theta_dot + b.theta_dot) - 2.0 * moved
+    return (a.theta + s * (h * a.theta_dot + s * (c2 + s * c3)),
+            a.theta_dot + s * (2.0 * c2 + 3.0 * s * c3) / h)
 
 
 @njit(nogil=True)

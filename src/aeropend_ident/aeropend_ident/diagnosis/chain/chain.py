@@ -230,12 +230,10 @@ class CutChain:
         state = dynamics.State(omega=float(speed[0]), theta=values.get("initial.theta", 0.0),
                                theta_dot=values.get("initial.theta_dot", 0.0),
                                thrust=float(actuator.thrust(n, speed[0])))
-        out = np.empty((2, len(speed)))
+        theta, rate = np.empty(len(speed)), np.empty(len(speed))
         for piece, m in self.pieces(values, stop):
-            part = np.empty((2, piece.stop - piece.start))
-            state = dynamics.run_arm(speed[piece], state, *dynamics.prepare(m, s.period), part)
-            out[:, piece] = part
-        return out[0], out[1]
+            theta[piece], rate[piece], state = dynamics.swing(m, speed[piece], state, s.period)
+        return theta, rate
 
     def arm_residuals(self, values: Values) -> dict[str, Array]:
         """Residual of the angle over the training part, in units of its noise."""
