@@ -16,12 +16,25 @@ BENCH = load("bench")
 
 def test_a_messy_rig_has_many_imperfections_and_one_main_effect():
     rng = np.random.default_rng(3)
-    drawn, shares = circumstances.messy(rng, BENCH.model, BENCH.sensing, cases.duty_signal(rng, 20.0))
+    rig = circumstances.Weighed(BENCH.model, BENCH.model, BENCH.sensing, cases.duty_signal(rng, 20.0))
+    drawn, shares = circumstances.messy(rng, rig)
     assert 11 <= len(drawn) <= 13
     assert len({d.effect for d in drawn}) == len(drawn)
     main = drawn[0].effect
     assert main in plant.EFFECTS
     assert shares[main] == max(shares.values()) > circumstances.MAIN_SHARE[0]
+
+
+def test_a_refit_absorbs_as_much_as_the_model_file_may_be_off():
+    """The resistance is at the upper end of its tolerance: a refit may lower it, and not raise it."""
+    numbers = {**BENCH.model, "R_a": (1.0 + cases.OFF) * BENCH.model["R_a"]}
+    rig = circumstances.Weighed(numbers, BENCH.model, BENCH.sensing, cases.duty_signal(np.random.default_rng(3), 10.0))
+
+    def left(factor):
+        p = rig.packed({}, {}, other=False, numbers={**numbers, "R_a": factor * numbers["R_a"]})
+        return rig.gap(rig.moved(p, np.zeros(0)))
+
+    assert left(0.94) < 0.05 * left(1.06)
 
 
 def test_three_effects_are_at_three_places():

@@ -19,10 +19,10 @@ pytestmark = pytest.mark.timeout(600)
 def checked(tmp_path_factory):
     """Labels and verdicts; the labels are elsewhere while verdicts are made."""
     out = tmp_path_factory.mktemp("unknown") / "made"
-    uncalibrated.make(out, COUNT, SEED, DURATION, 2)
+    uncalibrated.make(out, COUNT, SEED, DURATION, 1)
     sealed = out / folder.SEALED
     sealed.rename(out.parent / "elsewhere")
-    folder.diagnose_all(out, 2, fit_nominal=True)
+    folder.diagnose_all(out, 1, fit_nominal=True)
     (out.parent / "elsewhere").rename(sealed)
     return out
 

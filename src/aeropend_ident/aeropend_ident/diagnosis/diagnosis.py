@@ -460,8 +460,8 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
                     tuple(reasons), None if unknown is None else _drawn(unknown.term, found.learned, joint, gaps,
                                                                           settings.jobs),
                     tuple(conclude.names(a, b) for a, b in undecided),
-                    conclude.next_experiment(chains.model, found.recordings[0], undecided, joint.values, tried,
-                                             settings.jobs),
+                    conclude.next_experiment(chains.model, found.recordings[0], undecided,
+                                             _unlearned(joint.values, found.learned), tried, settings.jobs),
                     _families(head.small)),
         closure=Closure(gaps.before.total, gaps.after.total, gaps.before.total_floor(gaps.floors), closed, low, high,
                         budget=gaps.budget(gust=found.statistical.gust is not None, jobs=settings.jobs)),
@@ -469,6 +469,11 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
         since=None if chains.known is None else since.changes(
             chains.known, joint, found.statistical, head.claimed),
         estimates=None if failed else since.estimates(joint, found.statistical))
+
+
+def _unlearned(values: Mapping[str, float], learned: Learned | None) -> dict[str, float]:
+    """The values without those of a learned term: no experiment is designed for its many numbers."""
+    return {n: v for n, v in values.items() if learned is None or key(n).owner != learned.id}
 
 
 def _families(ids: Sequence[str]) -> tuple[str, ...]:
