@@ -27,15 +27,11 @@ help: ## show this
 demo: .venv/.runtime ## run a plant with a hidden effect and name it (EFFECT=coulomb_friction pins one, ARGS="--help")
 	$(BIN)/demo $(if $(EFFECT),--effect $(EFFECT)) $(ARGS)
 
-# First what only computes, then what runs nodes, two files at a time, then what needs the machine to itself. Nodes share two
-# cores badly, so a test of theirs that fails is tried again, and the summary says so. Exit code 5: ARGS chose none of these.
 test: .venv/.dev ## build and test with colcon in a temporary folder, then run every test (ARGS="-k plant")
 	tools/setup test
 	$(MAKE) -C firmware
 	tools/colcon-check
-	$(BIN)/python -m pytest -n auto --dist loadscope -m "not live" $(ARGS) || [ $$? = 5 -a -n "$(ARGS)" ]
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "live and not alone" --reruns 2 -rR $(ARGS) || [ $$? = 5 -a -n "$(ARGS)" ]
-	$(BIN)/python -m pytest -m alone --reruns 2 -rR $(ARGS) || [ $$? = 5 -a -n "$(ARGS)" ]
+	tools/test $(ARGS)
 
 bench: .venv/.dev ## measure speed beside C, scipy, pysindy and rosbags (ARGS=--quick; ARGS=--docs writes docs/results/bench.md)
 	tools/setup compiler
