@@ -9,7 +9,7 @@ setup(
     name=PACKAGE,
     version="0.1.0",
     packages=find_packages(exclude=["test", "test.*"]),
-    package_data={"aeropend_sim": ["config/*", "urdf/*.urdf", "layouts/*", "py.typed"]},
+    package_data={"aeropend_sim": ["config/*", "urdf/*.urdf", "layouts/*", "export/*.c", "py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -28,6 +28,7 @@ setup(
     entry_points={
         "console_scripts": [
             "aeropend = aeropend_sim.cli.aeropend:main",
+            "export = aeropend_sim.export.command:main",
             "plant = aeropend_sim.nodes.plant:main",
             "pose = aeropend_sim.nodes.pose:main",
         ]

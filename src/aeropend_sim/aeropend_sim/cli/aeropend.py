@@ -28,6 +28,7 @@ PURPOSES = {
     "Simulate": {
         "plant": "simulate the rig as a node, with chosen effects",
         "pose": "publish the pose of the rig for a 3D view",
+        "export": "write a model for MuJoCo, Simulink, Gazebo, C or Python",
     },
     "Use a real rig": {
         "bridge": "connect the board of a rig to ROS",

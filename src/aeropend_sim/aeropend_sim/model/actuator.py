@@ -88,9 +88,24 @@ def voltages(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, f
     first, then, part = _over_hold(numbers, duty, effects, period, start, before)
     if part == 0.0:
         return then, first
+    return acting(first, then, share_of_first(numbers, part, period)), first
+
+
+def acting(first: ArrayLike, then: ArrayLike, share: float) -> Array:
+    """Voltage (V) that drives the winding to the same current as one voltage, and another one after it."""
+    return np.asarray(share * np.asarray(first) + (1.0 - share) * np.asarray(then))
+
+
+def share_of_first(numbers: Numbers, part: float, period: float) -> float:
+    """Weight of the voltage before a change within a hold, for `acting`.
+
+    Args:
+        numbers: parameters of the model.
+        part: share of the hold before the change.
+        period: [s] length of the hold.
+    """
     lengths = period * numbers["R_a"] / numbers["L_a"]  # of the hold, in time constants of the winding
-    share = math.expm1(part * lengths) / math.expm1(lengths) if lengths < 500.0 else 0.0
-    return share * first + (1.0 - share) * then, first
+    return math.expm1(part * lengths) / math.expm1(lengths) if lengths < 500.0 else 0.0
 
 
 def acting_voltage(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, float]],
@@ -123,26 +138,32 @@ def sampled_voltage(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping
 def _over_hold(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, float]], period: float, start: int,
                before: float) -> tuple[Array, Array, float]:
     """Voltage (N,) at the start of each hold, voltage (N,) after a delayed change, and share of the hold before it."""
-    n = len(duty)
-
-    def at_bridge(v: Array) -> Array:
-        if "supply_drift" in effects:
-            time = (start + np.arange(n)) * period
-            v = v * np.maximum(0.0, 1.0 - effects["supply_drift"]["rate"] * time)
-        if "bridge_drop" in effects:
-            v = np.sign(v) * np.maximum(0.0, np.abs(v) - effects["bridge_drop"]["v_drop"])
-        return v
-
-    delay = effects["command_delay"]["delay"] / period if "command_delay" in effects else 0.0
-    whole = math.floor(delay + 1e-9)
-    part = max(delay - whole, 0.0) if delay - whole > 1e-9 else 0.0
+    n, (whole, part) = len(duty), delay(effects, period)
+    time = (start + np.arange(n)) * period
     if whole == 0 and part == 0.0:
-        v = at_bridge(voltage(numbers, duty))
+        v = at_bridge(voltage(numbers, duty), time, effects)
         return v, v, 0.0
     # a negative delay takes later duties of the series; after its end the last duty stays
     late = voltage(numbers, np.concatenate([np.full(max(whole + 1, 0), before), duty, duty[n - max(-whole, 0):]]))
-    then = at_bridge(late[1:n + 1])
-    return (at_bridge(late[:n]) if part > 0.0 else then), then, part
+    then = at_bridge(late[1:n + 1], time, effects)
+    return (at_bridge(late[:n], time, effects) if part > 0.0 else then), then, part
+
+
+def delay(effects: Mapping[str, Mapping[str, float]], period: float) -> tuple[int, float]:
+    """Whole periods by which a duty acts late, and the share of a period beyond them; below 0 it acts early."""
+    periods = effects["command_delay"]["delay"] / period if "command_delay" in effects else 0.0
+    whole = math.floor(periods + 1e-9)
+    return whole, max(periods - whole, 0.0) if periods - whole > 1e-9 else 0.0
+
+
+def at_bridge(v: ArrayLike, time: ArrayLike, effects: Mapping[str, Mapping[str, float]]) -> Array:
+    """Voltage (V) at the bridge, from that of the duty's map (V), after a time (s)."""
+    acts: Array = np.asarray(v, dtype=float)
+    if "supply_drift" in effects:
+        acts = acts * np.maximum(0.0, 1.0 - effects["supply_drift"]["rate"] * np.asarray(time, dtype=float))
+    if "bridge_drop" in effects:
+        acts = np.sign(acts) * np.maximum(0.0, np.abs(acts) - effects["bridge_drop"]["v_drop"])
+    return acts
 
 
 ScalarOrArray = TypeVar("ScalarOrArray", float, Array)

@@ -834,6 +834,31 @@ def since(state: State, past: Past) -> State:
                  past.time, past.memory)
 
 
+@equation
+def at_terminals(v: float, state: State, e: Values | None, added: Terms | None) -> float:
+    """[V] Voltage at the motor's terminals, from that at the bridge (V)."""
+    if e is None:
+        return v
+    loaded = v - e.supply_sag_r_supply * state.i_a
+    if added is not None:
+        loaded += term_sum(0, added.actuator, quantities(state, v), state.memory, added)
+    return loaded
+
+
+@equation
+def next_gust(state: State, noise: float, x: Extra | None) -> State:
+    """The state with the gust of the next hold.
+
+    Args:
+        state: after a hold.
+        noise: a standard normal number.
+        x: coefficients of the effects.
+    """
+    s = state
+    return State(s.i_a, s.omega, s.rotor_angle, s.theta, s.theta_dot, s.thrust, s.heat, s.flex, s.flex_dot,
+                 x.gust_decay * s.gust + x.gust_kick * noise, s.time, s.memory)
+
+
 def steady(model: Model, duty: float) -> State:
     """Steady state of the nominal plant for a duty; the arm hangs if the thrust exceeds its weight.
 
@@ -1040,18 +1065,11 @@ def run(v: Array, noise: Array, state: State, c: Coefficients, e: Values | None,
         out[ROW.theta, k], out[ROW.theta_dot, k] = state.theta, state.theta_dot
         out[ROW.i_a, k], out[ROW.omega, k] = state.i_a, state.omega
         out[ROW.rotor_angle, k], out[ROW.thrust, k] = state.rotor_angle, state.thrust
-        if e is None:
-            out[ROW.v_a, k] = v[k]
-        else:
-            out[ROW.v_a, k] = v[k] - e.supply_sag_r_supply * state.i_a
-            if added is not None:
-                out[ROW.v_a, k] += term_sum(0, added.actuator, quantities(state, v[k]), state.memory, added)
+        out[ROW.v_a, k] = at_terminals(v[k], state, e, added)
         for _ in range(c.steps):
             state = advance(state, v[k], c, e, x, added)
         if e is not None:
-            s = state
-            state = State(s.i_a, s.omega, s.rotor_angle, s.theta, s.theta_dot, s.thrust, s.heat, s.flex, s.flex_dot,
-                          x.gust_decay * s.gust + x.gust_kick * noise[k], s.time, s.memory)
+            state = next_gust(state, noise[k], x)
     return state
 
 

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_sim.compiled import njit
-from aeropend_sim.model.dynamics import NO_LAG, ROW, Lag, lag
+from aeropend_sim.model.dynamics import NO_LAG, ROW, Lag, equation, lag
 from aeropend_sim.model.effects import DEFINED, SPIKE_FACTOR
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
-from aeropend_sim.model.terms import series
+from aeropend_sim.model.terms import EMPTY, Quantities, Terms, series, term_sum, terms
 
 Array = NDArray[np.float64]
 
@@ -153,15 +153,39 @@ def seen_angle(model: Model, theta: Array, theta_dot: Array, period: float, star
         period: [s] time between samples.
         start: [s] time of the first sample.
     """
-    if "theta" not in readings_with_errors(model):
+    wrong = terms(model.effects, ("theta",))
+    if wrong is None:
         return theta, theta_dot
+    seen, rate = np.empty(len(theta)), np.empty(len(theta))
+    _see(theta, theta_dot, start, period, wrong, seen, rate)
+    return seen, rate
 
-    def error(ahead: float) -> Array:
-        t: Array = start + period * np.arange(len(theta), dtype=np.float64) + ahead
-        return series(model.effects, "theta", len(theta), period, theta=theta + ahead * theta_dot, theta_dot=theta_dot,
-                      t=t)
 
-    return theta + error(0.0), theta_dot + (error(AHEAD) - error(-AHEAD)) / (2.0 * AHEAD)
+@njit()
+def _see(theta: Array, theta_dot: Array, start: float, period: float, wrong: Terms, seen: Array, rate: Array) -> None:
+    for k in range(theta.shape[0]):
+        seen[k], rate[k] = seen_with_errors(theta[k], theta_dot[k], start + period * k, wrong)
+
+
+@equation
+def angle_error(theta: float, theta_dot: float, t: float, wrong: Terms) -> float:
+    """[rad] Sum of the errors of the angle that are given by formulas."""
+    return term_sum(0, wrong.arm_friction, Quantities(theta, theta_dot, 0.0, 0.0, 0.0, 0.0, t), EMPTY, wrong)
+
+
+@equation
+def seen_with_errors(theta: float, theta_dot: float, t: float, wrong: Terms) -> tuple[float, float]:
+    """As `seen_angle`, at one instant.
+
+    Args:
+        theta: [rad] true angle.
+        theta_dot: [rad/s] true rate.
+        t: [s] time.
+        wrong: errors of the angle.
+    """
+    later = angle_error(theta + AHEAD * theta_dot, theta_dot, t + AHEAD, wrong)
+    earlier = angle_error(theta - AHEAD * theta_dot, theta_dot, t - AHEAD, wrong)
+    return theta + angle_error(theta, theta_dot, t, wrong), theta_dot + (later - earlier) / (2.0 * AHEAD)
 
 
 def read_angle(model: Model, theta: Array, theta_dot: Array, period: float = SAMPLE_PERIOD) -> Array:
@@ -215,6 +239,18 @@ def encoder_angle(theta: float, c: MeasurementChain) -> float:
     """
     angle = theta + c.bias
     return angle + c.amplitude * math.sin(theta + c.phase) if c.amplitude != 0.0 else angle
+
+
+@njit()
+def current_reading(current: float, c: MeasurementChain) -> float:
+    """[A] Reading of a current, before noise and quantisation."""
+    return c.current_factor * current + c.current_bias
+
+
+@njit()
+def voltage_reading(voltage: float, c: MeasurementChain) -> float:
+    """[V] Reading of a voltage, before noise and quantisation."""
+    return voltage + c.voltage_bias
 
 
 @njit()
@@ -360,9 +396,9 @@ def read(out: Array, truth: Array, normal: Array, uniform: Array, m: Memory, fir
             out[READING.omega, k] = omega + c.speed_noise * normal[k, 1]
             if uniform[k, 0] < -math.expm1(-c.spike_rate * c.h):
                 out[READING.omega, k] *= SPIKE_FACTOR[0] + (SPIKE_FACTOR[1] - SPIKE_FACTOR[0]) * uniform[k, 1]
-        current = c.current_factor * i_a + c.current_bias
+        current = current_reading(i_a, c)
         out[READING.i_a, k] = _quantise(current + c.current_noise * normal[k, 2], c.current_lsb)
-        out[READING.v_a, k] = _quantise(v_a + c.voltage_bias + c.voltage_noise * normal[k, 3], c.voltage_lsb)
+        out[READING.v_a, k] = _quantise(voltage_reading(v_a, c) + c.voltage_noise * normal[k, 3], c.voltage_lsb)
     return m
 
 

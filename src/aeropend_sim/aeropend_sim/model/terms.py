@@ -92,20 +92,35 @@ def terms(effects: Mapping[str, Mapping[str, float]], places: Sequence[str] = PL
     Raises:
         UserError: more than `SLOTS` of them have a memory.
     """
-    active = sorted(((e, p) for id_, p in effects.items() if (e := DEFINED.get(id_)) is not None and e.term
-                     and _where(e) in places and is_active(id_, p)), key=lambda one: places.index(_where(one[0])))
+    active = in_order(effects, places)
     if not active:
         return None
-    rows, memories = [], 0
-    for e, p in active:
+    rows = []
+    for e, numbers, slot in active:
         own = tuple(e.parameters)
         rate = compiled(e.rate, own, e.memory).address if e.memory else 0
-        numbers = [p.get(name, q.neutral) for name, q in e.parameters.items()]
-        rows.append((compiled(e.term, own, e.memory).address, rate, min(memories, SLOTS), numbers))
-        memories += bool(e.memory)
-    if memories > SLOTS:
-        raise UserError(f"{memories} effects by formula with a memory; {SLOTS} are possible in one model")
-    return _held(rows, [sum(_where(e) in places[:k + 1] for e, _ in active) for k in range(len(PLACES))])
+        rows.append((compiled(e.term, own, e.memory).address, rate, slot, list(numbers.values())))
+    return _held(rows, [sum(_where(e) in places[:k + 1] for e, *_ in active) for k in range(len(PLACES))])
+
+
+def in_order(effects: Mapping[str, Mapping[str, float]], places: Sequence[str] = PLACES
+             ) -> list[tuple[Effect, dict[str, float], int]]:
+    """The active effects by formula in the order of their rows in `Terms`, each with its parameters and its slot.
+
+    Args:
+        effects: effect id -> parameter name -> value, complete.
+        places: of the chain, or readings, of which terms are wanted.
+
+    Raises:
+        UserError: more than `SLOTS` of them have a memory.
+    """
+    active = sorted(((e, p) for id_, p in effects.items() if (e := DEFINED.get(id_)) is not None and e.term
+                     and _where(e) in places and is_active(id_, p)), key=lambda one: places.index(_where(one[0])))
+    memories = [bool(e.memory) for e, _ in active]
+    if sum(memories) > SLOTS:
+        raise UserError(f"{sum(memories)} effects by formula with a memory; {SLOTS} are possible in one model")
+    return [(e, {name: p.get(name, q.neutral) for name, q in e.parameters.items()}, min(sum(memories[:k]), SLOTS))
+            for k, (e, p) in enumerate(active)]
 
 
 def _where(e: Effect) -> str:
