@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draw docs/export-mujoco.png: a rig's recording beside the arm in MuJoCo, without and with the effect that was found.
 
-`python -m evaluation.export_picture [--out FILE]`. A rig is recorded, `diagnose` finds what its model lacks, the nominal
-and the augmented model are exported, and MuJoCo runs both with the recorded duty.
+`python -m evaluation.export_picture [--out FILE]`: a rig is recorded, `diagnose` finds what its model lacks, the
+nominal and the augmented model are exported, and MuJoCo runs both with the recorded duty.
 """
 
 from __future__ import annotations
