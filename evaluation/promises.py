@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "promises.md"
 
 SECTIONS = ("Start", "Commands", "Recordings", "Tables", "Verdict", "Uncalibrated rigs", "Augmented model",
-            "Identification", "Control", "Hardware", "Views", "Measurements", "Packages")
+            "Other simulators", "Identification", "Control", "Hardware", "Views", "Measurements", "Packages")
 """The sections of the page, in their order."""
 
 MEASURED = (

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import xml.etree.ElementTree as ET
 
 import distributed
 import numpy as np
@@ -117,9 +118,16 @@ def test_every_rig_gets_its_verdict_and_what_cannot_be_used_its_reason(alone, re
 
 @pytest.mark.promise("Verdict", "`--each` gives each rig its verdict; processes, Dask and threads do not change it")
 def test_processes_find_the_same_to_the_last_bit(alone, recordings, tmp_path):
-    result = run("--each", *recordings, "--out", tmp_path / "out", "--jobs", 2)
-    assert (result.returncode, result.stderr) == (0, "")
+    result = run("--each", *recordings, "--out", tmp_path / "out", "--jobs", 2, "--junit", tmp_path / "verdicts.xml",
+                 "--fail-on", "coulomb_friction>20%", "--fail-on", "unknown")
+    assert (result.returncode, result.stderr) == (1, "")
     assert verdicts(tmp_path / "out") == verdicts(alone[0])
+    last = result.stdout.splitlines()[-1]
+    assert last.startswith(f"check: failed, 1 of 6 rules broken: {recordings[3]}: coulomb_friction>20% (it is ")
+    assert last.endswith("; 2 without a verdict")
+    (suite,) = ET.parse(tmp_path / "verdicts.xml").getroot()
+    assert [suite.get(name) for name in ("tests", "failures", "errors")] == ["10", "1", "4"]
+    assert [case.get("classname") for case in suite if case.find("failure") is not None] == [str(recordings[3])]
 
 
 @pytest.mark.promise("Verdict", "`--each` gives each rig its verdict; processes, Dask and threads do not change it")

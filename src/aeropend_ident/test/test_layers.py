@@ -24,7 +24,7 @@ LAYERS = [
     ["diagnosis.since"],
     ["diagnosis.diagnosis"],
     ["diagnosis.report"],
-    ["diagnosis.results"],
+    ["diagnosis.results", "diagnosis.checks"],
     ["diagnosis.batch", "diagnosis.dask_cluster"],
     ["tables", "bench_tests", "checkup"],
     ["public", "testing"],

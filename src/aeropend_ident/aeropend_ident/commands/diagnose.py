@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command `diagnose`: recordings in, verdict out.
 
-Exit code 0 with a verdict, 2 with one line on standard error when the input cannot be used.
+Exit code 0 with a verdict, 1 if it breaks a rule of `--fail-on`, 2 with one line on standard error when the input
+cannot be used.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from aeropend_ident.bags.recording import RecordingError
-from aeropend_ident.diagnosis import batch, dask_cluster, since
+from aeropend_ident.diagnosis import batch, checks, dask_cluster, since
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.document import Across, DocumentError, Identified
 from aeropend_ident.diagnosis.document import read as read_document
@@ -34,6 +35,7 @@ from aeropend_ident.signals.signals import Mounting
 from aeropend_sim.cli import browser
 from aeropend_sim.cli.command import Parser, between, entry_point, own
 from aeropend_sim.cli.progress import progress
+from aeropend_sim.errors import UserError
 from aeropend_sim.model import effect_file
 from aeropend_sim.model.parameters import PRESETS, load
 from aeropend_sim.untrusted import printable
@@ -49,9 +51,18 @@ EXAMPLES = """examples:
   diagnose my_bag --effects my_effects.yaml      try effects by formula too (docs/guide/effects.md)
   diagnose my_bag --open                         show the report in the browser
   diagnose my_bag --out verdict --jobs 2         choose the folder and the number of threads
+  diagnose my_bag --fail-on "gap>5%" --fail-on unknown --junit verdict.xml       for a machine that decides
   plant --ros-args --params-file verdict/augmented.yaml      simulate the augmented model
 
-exit codes: 0 a verdict was written, 2 the input cannot be used (one line says why), 130 interrupted"""
+rules of --fail-on:
+  gap>5%                 the gap on held-out data is larger than this share of the signals' spread; so gap_after, and
+                         closed<90% of the share that closes
+  coulomb_friction>10%   this effect is claimed with a larger share of the squared gap; share>10%: any effect
+  coulomb_friction       it is claimed at all
+  effect, unknown, cannot_tell, not_separable, not_determined       the verdict is so
+
+exit codes: 0 a verdict was written, 1 it breaks a rule of --fail-on, 2 the input cannot be used (one line says why),
+130 interrupted"""
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -94,6 +105,10 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--effects", action="append", default=[], metavar="FILE",
                         help="effect file: effects by formula that are tried beside those of the catalogue; may be "
                              "given several times")
+    parser.add_argument("--fail-on", action="append", default=[], metavar="RULE",
+                        help="end with exit code 1 if the verdict is so, see below; may be given several times")
+    parser.add_argument("--junit", metavar="FILE",
+                        help="write what each rule of --fail-on says as JUnit XML; the file is replaced")
     parser.add_argument("--overwrite", action="store_true", help="replace results in the folder")
     parser.add_argument("--open", action="store_true", help="show the report in the browser")
     options = parser.parse_args(arguments)
@@ -110,6 +125,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         parser.error("--open shows one report: leave --each out")
     if options.test and options.each:
         parser.error("--test needs recordings of one rig: leave --each out")
+    if options.junit and not options.fail_on:
+        parser.error("--junit writes what rules say: give at least one --fail-on")
     for bag in options.test:
         if Path(bag).resolve() in {Path(fitted).resolve() for fitted in options.bags}:
             parser.error(f"--test {bag}: nothing may be fitted to a test recording; give it once")
@@ -143,8 +160,11 @@ def effects_of(files: Sequence[str]) -> tuple[str, ...]:
     return tuple(id_ for file in files for id_ in effect_file.load(file))
 
 
-def run(options: argparse.Namespace, command: str) -> None:
+def run(options: argparse.Namespace, command: str, rules: Sequence[checks.Rule]) -> list[checks.Outcome]:
     """Diagnose recordings of one rig together and write the results.
+
+    Returns:
+        What rules say of the verdict.
 
     Raises:
         RecordingError, ModelError, OutputError: the input or the output cannot be used.
@@ -184,10 +204,14 @@ def run(options: argparse.Namespace, command: str) -> None:
     print(printable(f"{out / 'report.html'}   {out / 'augmented.yaml'}   {results.document.seconds} s"))
     if options.open and (why_not := browser.show(out / "report.html")):
         print(printable(f"diagnose: {why_not}"), file=sys.stderr)
+    return checks.check(results.document, rules)
 
 
-def run_each(options: argparse.Namespace) -> None:
+def run_each(options: argparse.Namespace, rules: Sequence[checks.Rule]) -> list[checks.Outcome]:
     """Diagnose recordings of different rigs; write each result as it comes, and a table of all.
+
+    Returns:
+        What rules say of each verdict.
 
     Raises:
         RecordingError, ModelError, OutputError, ClusterError: none can be diagnosed.
@@ -203,7 +227,7 @@ def run_each(options: argparse.Namespace) -> None:
                               options.material, options.seconds, further,
                               effect_file.definitions([*further, *model.effects]))
     commands = [_alone(options, bag, out / name) for bag, name in zip(options.bags, names)]
-    rows = []
+    rows, said = [], []
     try:
         with (dask_cluster.cluster(options.dask) as client,
               progress(f"0 of {len(names)} recordings", len(names)) as show,
@@ -211,6 +235,9 @@ def run_each(options: argparse.Namespace) -> None:
             for name, outcome in zip(names, outcomes):
                 if outcome.results is not None:
                     outcome.results.write(out / name, overwrite=options.overwrite)
+                    said += checks.check(outcome.results.document, rules)
+                else:
+                    said += [checks.Outcome(outcome.bag, rule.text, error=outcome.error) for rule in rules]
                 rows.append(batch.row(outcome, name))
                 show(len(rows), f"{len(rows)} of {len(names)} recordings")
     except KeyboardInterrupt:
@@ -227,6 +254,7 @@ def run_each(options: argparse.Namespace) -> None:
         raise RecordingError(f"none of the {refused} recordings can be used; {out / batch.SUMMARY} says why")
     print(printable(f"{len(rows) - refused} of {len(rows)} diagnosed   {out / batch.SUMMARY}   "
                     f"{time.monotonic() - started:.1f} s"))
+    return said
 
 
 def _alone(options: argparse.Namespace, bag: str, out: Path) -> str:
@@ -268,11 +296,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
     arguments = own(arguments)
     options = parse(arguments)
-    if options.each:
-        run_each(options)
-    else:
-        run(options, shlex.join(["diagnose", *arguments]))
-    return 0
+    effects_of(options.effects)
+    rules = [checks.parse(text) for text in options.fail_on]
+    junit = Path(options.junit) if options.junit else None
+    try:
+        said = run_each(options, rules) if options.each else run(options, shlex.join(["diagnose", *arguments]), rules)
+    except UserError as error:
+        if junit is not None:
+            name = ", ".join(options.bags)
+            checks.write_junit(junit, [checks.Outcome(name, rule, error=str(error)) for rule in options.fail_on])
+        raise
+    if junit is not None:
+        checks.write_junit(junit, said)
+    if rules:
+        print(checks.summary(said))
+    return checks.BROKEN if any(one.broken for one in said) else 0
 
 
 if __name__ == "__main__":
