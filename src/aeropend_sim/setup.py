@@ -18,7 +18,7 @@ setup(
         (f"share/{PACKAGE}/layouts", ["aeropend_sim/layouts/foxglove.json", "aeropend_sim/layouts/plotjuggler.xml"]),
     ],
     install_requires=["argcomplete", "numba", "numpy", "PyYAML", "rich", "scipy"],
-    extras_require={"test": ["hypothesis", "pytest", "pytest-timeout"]},
+    extras_require={"mujoco": ["mujoco"], "test": ["hypothesis", "pytest", "pytest-timeout"]},
     python_requires=">=3.10",
     zip_safe=False,
     maintainer="aeropend maintainers",
@@ -29,6 +29,7 @@ setup(
         "console_scripts": [
             "aeropend = aeropend_sim.cli.aeropend:main",
             "export = aeropend_sim.export.command:main",
+            "import_model = aeropend_sim.export.import_model:main",
             "plant = aeropend_sim.nodes.plant:main",
             "pose = aeropend_sim.nodes.pose:main",
         ]

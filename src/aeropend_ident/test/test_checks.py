@@ -36,7 +36,7 @@ NONE = made("none", {}, 0.01, None)
 WORSE = Across("b", 0.6, 0.5, 0.1, 0.2, None, None)
 
 
-@pytest.mark.promise("Verdict", "`--fail-on` ends with exit code 1 if the verdict breaks a rule; `--junit` writes JUnit XML")
+@pytest.mark.promise("Verdict", "`--fail-on` gives exit code 1 if a verdict breaks a rule, `--junit` writes JUnit XML")
 @pytest.mark.parametrize(("rule", "document", "broken"), [
     ("gap>19%", FOUND, True), ("gap > 0.21", FOUND, False), ("gap>19%", NONE, False), ("gap_after>1e-3", NONE, True),
     ("closed<95%", FOUND, True), ("closed<95%", NONE, False), ("share>60%", FOUND, True), ("share>60%", NONE, False),

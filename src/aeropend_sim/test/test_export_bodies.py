@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yourdfpy
 
-from aeropend_sim.export import mujoco_drive, plant_step, rigid_body
+from aeropend_sim.export import import_model, mujoco_drive, plant_step, rigid_body
 from aeropend_sim.export.specialise import fields
 from aeropend_sim.model import dynamics, sensing
 from aeropend_sim.model.effects import CATALOGUE, DEFINED, RANDOM
@@ -137,3 +137,49 @@ def test_every_effect_is_held_by_a_description_or_named_as_missing():
         for kind, held in rigid_body.HELD.items():
             named = {each.name for each in rigid_body.missing(with_effects(id_), kind)}
             assert (id_ in named) != (id_ in held)
+
+
+@pytest.mark.promise("Other simulators", "A model that was exported as MJCF or URDF comes back by `import_model`")
+@pytest.mark.parametrize(("kind", "effects"), [("mjcf", ("coulomb_friction", "cable_torque")), ("urdf", ())])
+def test_an_exported_model_comes_back(kind, effects, tmp_path, capsys):
+    model = with_effects(*effects)
+    (tmp_path / "rig").write_text(getattr(rigid_body, kind)(model))
+    arguments = [str(tmp_path / "rig"), "--out", str(tmp_path / "back.yaml")]
+    lever = ["--lever", repr(rigid_body.arm(model).lever)] if kind == "urdf" else []
+    assert import_model.main([*arguments, *lever]) == 0
+    told = capsys.readouterr().out
+    assert "not in the file, from bench: motor and propeller (k0, " in told
+    back = load(tmp_path / "back.yaml")
+    assert dict(back.model) == pytest.approx(dict(model.model), rel=1e-8)
+    assert {id_: pytest.approx(p, rel=1e-8) for id_, p in back.effects.items()} == dict(model.effects)
+
+
+TILTED = """<mujoco><default><joint damping="0.01"/></default><worldbody><body>
+<joint name="shoulder" type="hinge" axis="0 -1 0"/>
+<geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.01" mass="0.1"/></body></worldbody></mujoco>"""
+
+
+def test_a_description_of_someone_else_is_understood(tmp_path):
+    (tmp_path / "rig.xml").write_text(TILTED)
+    found = import_model.read(tmp_path / "rig.xml", BENCH)
+    n = found.model.model
+    inertia = 0.01 / n["c_over_J"]
+    assert inertia == pytest.approx(0.1 * 0.3**2 / 3.0, rel=0.05)  # a rod, with round ends
+    assert n["mgd_over_J"] * inertia == pytest.approx(0.1 * 9.81 * 0.15)
+    assert n["L_over_J"] == BENCH.model["L_over_J"]
+    told = "\n".join(found.lines)
+    assert "L_over_J = 97.6: not in the file, from bench; give --lever if known" in told
+    assert "hangs at -1.5708 rad" in told
+
+
+@pytest.mark.parametrize(("text", "more", "words"), [
+    ("", [], "MuJoCo cannot read it as MJCF or URDF"), ("<mujoco/>", [], "it has 0 hinges; a pendulum needs one"),
+    (TILTED, ["--joint", "elbow"], "no hinge is named 'elbow'; it has: shoulder"),
+    (TILTED.replace("0 -1 0", "0 0 1"), [], "gravity does not turn the joint shoulder"),
+])
+def test_what_is_no_pendulum_is_refused_in_one_line(text, more, words, tmp_path, capsys):
+    (tmp_path / "rig.xml").write_text(text)
+    assert import_model.main([str(tmp_path / "rig.xml"), "--out", str(tmp_path / "out.yaml"), *more]) == 2
+    told = capsys.readouterr().err
+    assert words in told
+    assert told.count("\n") == 1

@@ -29,6 +29,7 @@ PURPOSES = {
         "plant": "simulate the rig as a node, with chosen effects",
         "pose": "publish the pose of the rig for a 3D view",
         "export": "write a model for MuJoCo, Simulink, Gazebo, C or Python",
+        "import_model": "make a model file from a description (MJCF or URDF)",
     },
     "Use a real rig": {
         "bridge": "connect the board of a rig to ROS",
