@@ -2,13 +2,13 @@
 """Descriptions of the arm, in the programs that read them: MuJoCo, and parsers of URDF and SDF."""
 
 import importlib
+import subprocess
 import sys
 import xml.etree.ElementTree as ET
 
 import mujoco
 import numpy as np
 import pytest
-import yourdfpy
 
 from aeropend_sim.export import import_model, mujoco_drive, plant_step, rigid_body
 from aeropend_sim.export.specialise import fields
@@ -84,34 +84,21 @@ def test_the_arm_alone_is_a_pendulum_of_the_models_frequency_and_damping():
     assert np.allclose(theta[::4], free.theta, atol=2e-3)
 
 
-def urdf_numbers(text: str, folder) -> dict[str, float]:
-    (folder / "rig.urdf").write_text(text)
-    robot = yourdfpy.URDF.load(str(folder / "rig.urdf"), build_scene_graph=False, load_meshes=False)
-    joint, link = robot.joint_map["arm"], robot.link_map["rod"]
-    return {"damping": float(joint.dynamics.damping), "friction": float(joint.dynamics.friction),
-            "mass": link.inertial.mass, "across": link.inertial.inertia[1, 1], "centre": -link.inertial.origin[2, 3]}
-
-
 @pytest.mark.promise("Other simulators", "A URDF parser and MuJoCo read the exported URDF: inertia, damping, friction")
-def test_a_parser_of_urdf_reads_inertia_damping_and_friction(tmp_path):
+def test_the_parser_of_ros_and_mujoco_read_the_urdf(tmp_path):
+    """check_urdf is urdfdom, with which ROS, Gazebo and Drake read a URDF."""
     model = with_effects("coulomb_friction", "mast_flex")
-    n, found = model.numbers(), urdf_numbers(rigid_body.urdf(model), tmp_path)
-    inertia = found["across"] + found["mass"] * found["centre"]**2
-    assert found["damping"] / inertia == pytest.approx(n["c_over_J"])
-    assert found["friction"] / inertia == pytest.approx(0.8)
-    assert found["mass"] * rigid_body.GRAVITY * found["centre"] / inertia == pytest.approx(n["mgd_over_J"])
-
-
-def test_mujoco_reads_the_urdf():
-    compiled = mujoco.MjModel.from_xml_string(rigid_body.urdf(with_effects("coulomb_friction")))
-    arm = rigid_body.arm(with_effects("coulomb_friction"))
-    assert compiled.dof_damping[0] == pytest.approx(arm.damping)
-    assert compiled.dof_frictionloss[0] == pytest.approx(arm.friction)
-    data = mujoco.MjData(compiled)
+    (tmp_path / "rig.urdf").write_text(rigid_body.urdf(model))
+    done = subprocess.run(["check_urdf", str(tmp_path / "rig.urdf")], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "child(1):  rod" in done.stdout
+    compiled, arm = mujoco.MjModel.from_xml_path(str(tmp_path / "rig.urdf")), rigid_body.arm(model)
+    assert (compiled.dof_damping[0], compiled.dof_frictionloss[0]) == pytest.approx((arm.damping, arm.friction))
+    data, full = mujoco.MjData(compiled), np.zeros((1, 1))
     mujoco.mj_forward(compiled, data)
-    full = np.zeros((1, 1))
     mujoco.mj_fullM(compiled, full, data.qM)
     assert full[0, 0] == pytest.approx(arm.inertia)
+    assert arm.damping / arm.inertia == pytest.approx(model.numbers()["c_over_J"])
 
 
 def test_the_sdf_has_the_numbers_of_the_mjcf():
