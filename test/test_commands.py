@@ -66,7 +66,8 @@ def test_the_commands_are_those_of_the_four_packages():
 def test_help_shows_examples_and_exit_codes(name, capsys):
     text = shown(COMMANDS[name], capsys)
     lines = [line.removeprefix("usage:").strip() for line in text.splitlines()]
-    examples = [line for line in lines if line == name or (line.startswith(f"{name} ") and "[-h]" not in line)]
+    examples = [line for line in lines if line.split(" ")[0] == name or line.startswith(f"aeropend {name} ")]
+    examples = [line for line in examples if "[-h]" not in line]
     assert len(examples) >= 2, text
     (codes,) = [line for line in lines if line.startswith("exit codes: 0 ")]
     assert "2 " in codes

@@ -17,7 +17,7 @@ PACKAGES = sorted(path.parent for path in ROOT.glob("src/*/package.xml"))
 OTHERWISE = {"compression": "comes with Python 3.14", "lz4": "rosbags brings it", "backports": "rosbags brings it",
              "llvmlite": "numba brings it", "threadpoolctl": "the README asks for it",
              "pysindy": "the README asks for it"}
-WITHOUT = {"matplotlib", "distributed", "h5py"}
+WITHOUT = {"matplotlib", "distributed", "h5py", "mujoco"}
 """Used where they are installed; what needs them says so where they are not."""
 MODULES = {"jinja2": "python3-jinja2", "serial": "python3-serial", "cobs": "python-cobs-pip",
            "rosbags": "python3-rosbags-pip"}

@@ -37,6 +37,7 @@ setup(
             "step_response = aeropend_ident.commands.step_response:main",
             "doctor = aeropend_ident.commands.doctor:main",
             "demo = aeropend_ident.commands.demo:main",
+            "precompile = aeropend_ident.commands.precompile:main",
         ]
     },
 )

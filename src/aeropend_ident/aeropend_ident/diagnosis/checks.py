@@ -18,7 +18,7 @@ from aeropend_sim.model.effects import DEFINED, PARAMETER_MISMATCH
 from aeropend_sim.untrusted import printable
 
 BROKEN = 1
-"""Exit code if a rule is broken. Convention of programs that check."""
+"""Exit code if a rule is broken (convention of programs that check)."""
 
 NUMBERS = {"gap": "gap of the nominal model on held-out data, over the spread of the signals",
            "gap_after": "the same of the augmented model", "closed": "share of the gap that closes",

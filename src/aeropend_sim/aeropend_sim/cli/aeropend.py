@@ -18,6 +18,7 @@ PURPOSES = {
         "diagnose": "find the effects that a model lacks, from recordings",
         "doctor": "check the installation, recordings and model files",
         "excitation_quality": "check how well an input excites each term of the model",
+        "precompile": "compile now what the first diagnosis would wait for",
     },
     "Record and convert": {
         "record": "write the topics of a rig into a bag",

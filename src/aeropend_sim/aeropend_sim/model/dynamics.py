@@ -880,17 +880,25 @@ def steps_in(model: Model, period: float) -> int:
         model: parameters and effects.
         period: [s] length of the hold.
     """
-    motor, arm_ = _rates(model, period)
-    return min(MOST_STEPS, math.ceil(period * max(1.0 / LONGEST_STEP, motor, arm_) - 1e-9))
+    return _steps_in(period, *_rates(*_parts(model), period))
 
 
-def _rates(model: Model, period: float) -> tuple[float, float]:
+def _steps_in(period: float, *rates: float) -> int:
+    return min(MOST_STEPS, math.ceil(period * max(1.0 / LONGEST_STEP, *rates) - 1e-9))
+
+
+def _parts(model: Model) -> tuple[Mapping[str, float], Values | None, Terms | None]:
+    """Parameters, effects and terms by formula of a model."""
+    e, added = values(model.effects), terms(model.effects)
+    return model.numbers(), NO_EFFECT if e is None and added is not None else e, added
+
+
+def _rates(n: Mapping[str, float], e: Values | None, added: Terms | None, period: float) -> tuple[float, float]:
     """[1/s] Number of steps in a second that the motor and the arm need, by the rates of their fastest motions.
 
     The factors (0.04, 0.02, 0.1, 0.3) are choices; the tests compare the result with scipy's integrators for fast
     plants.
     """
-    n, e, added = model.numbers(), values(model.effects), terms(model.effects)
     top_speed = float(actuator.voltage(n, 1.0)) / n["K_e"]  # rad/s, never reached
     back = n["K_t"] * n["K_e"] / (n["J_m"] * n["L_a"])  # 1/s²: the speed acts back on itself through the winding
     motor = [min(math.sqrt(back / 0.04), back * n["L_a"] / (0.02 * n["R_a"])),
@@ -968,15 +976,12 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0
         The coefficients, the effects, the coefficients of the effects, and their terms by formula. What the model does
         not need is None.
     """
-    return _prepared(model, period, steps or steps_in(model, period))
+    n, e, added = _parts(model)
+    return _prepared(n, e, added, period, steps or _steps_in(period, *_rates(n, e, added, period)))
 
 
-def _prepared(model: Model, period: float, steps: int
+def _prepared(n: Mapping[str, float], e: Values | None, added: Terms | None, period: float, steps: int
               ) -> tuple[Coefficients, Values | None, Extra | None, Terms | None]:
-    n = model.numbers()
-    e, added = values(model.effects), terms(model.effects)
-    if e is None and added is not None:
-        e = NO_EFFECT
     h = period / steps
     resistance = n["R_a"] + (e.supply_sag_r_supply if e else 0.0)
     c = Coefficients(steps, h, lag(resistance / n["L_a"], h), lag(n["B_m"] / n["J_m"], h), 1.0 / n["L_a"],
@@ -1087,14 +1092,15 @@ def swing(model: Model, speed: Array, state: State, period: float = SAMPLE_PERIO
     Returns:
         θ and θ̇ (N,) at the samples, and the state after the last one.
     """
-    rate = max(_rates(model, period)[1], 1.0 / LONGEST_ARM_STEP)
+    parts = _parts(model)
+    rate = max(_rates(*parts, period)[1], 1.0 / LONGEST_ARM_STEP)
     out = np.empty((2, len(speed)))
     every, done = math.floor(1.0 / (period * rate) + 1e-9), 0
     if every > 1:
         done = (len(speed) - 1) // every * every
-        state = run_arm(speed[:done + 1], state, every, *_prepared(model, every * period, 1), out[:, :done])
+        state = run_arm(speed[:done + 1], state, every, *_prepared(*parts, every * period, 1), out[:, :done])
     steps = min(MOST_STEPS, math.ceil(period * rate - 1e-9))
-    state = run_arm(speed[done:], state, 1, *_prepared(model, period, steps), out[:, done:])
+    state = run_arm(speed[done:], state, 1, *_prepared(*parts, period, steps), out[:, done:])
     return out[0], out[1], state
 
 
