@@ -6,6 +6,10 @@ and constants from other files: after a change there, numba runs the old code. I
 (https://numba.readthedocs.io/en/stable/user/jit.html#cache). Here the names of the cache files contain a hash of the
 function's module and of all modules of these packages that it imports, directly or indirectly.
 
+numba also numbers the files of a function's signatures. Two processes that compile two signatures at the same time
+may give both the same number, and one signature then runs the code of the other, which ends in wrong numbers or a
+segmentation fault. Here the name of a file contains a hash of its signature.
+
 The rest works as in numba: where the cache is, `NUMBA_CACHE_DIR`, and the user's cache folder if the folder of the
 source is read-only.
 
@@ -24,7 +28,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
-from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -71,10 +75,11 @@ def source_hash(module: str) -> str:
     Args:
         module: its name. It is imported, or its imports are done.
     """
-    digest = hashlib.blake2b(digest_size=6)
-    for name in sorted(_reachable(module)):
-        digest.update(f"{name}\n".encode() + _source(name))
-    return digest.hexdigest()
+    return _hash(b"".join(f"{name}\n".encode() + _source(name) for name in sorted(_reachable(module))))
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.blake2b(content, digest_size=6).hexdigest()
 
 
 def _reachable(module: str) -> set[str]:
@@ -124,7 +129,7 @@ class _Names(CompileResultCacheImpl):
     def prune(self) -> None:
         """Remove all versions of this function except the latest ones. Files of numba alone count as one version."""
         versions: dict[str | None, list[Path]] = {}
-        named = re.compile(re.escape(self._function) + r"-\d+\.py\w+(?:\.([0-9a-f]{12}))?\.(?:nbi|\d+\.nbc)")
+        named = re.compile(re.escape(self._function) + r"-\d+\.py\w+(?:\.([0-9a-f]{12}))?\.(?:nbi|[0-9a-f]+\.nbc)")
         for path in Path(self.locator.get_cache_path()).iterdir():
             if match := named.fullmatch(path.name):
                 versions.setdefault(match[1], []).append(path)
@@ -135,8 +140,22 @@ class _Names(CompileResultCacheImpl):
                     path.unlink(missing_ok=True)
 
 
+class _Files(IndexDataCacheFile):
+    """Gives each signature a file that no other signature has."""
+
+    def save(self, key: Any, data: Any) -> None:
+        """Save the compiled code of a signature."""
+        name = self._data_name_pattern.replace("{number:d}", _hash(repr(key).encode()))
+        self._save_data(name, data)
+        self._save_index({**self._load_index(), key: name})
+
+
 class _Cache(FunctionCache):
     _impl_class = _Names
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._cache_file = _Files(self._cache_path, self._impl.filename_base, self._impl.locator.get_source_stamp())
 
     def save_overload(self, sig: Any, data: Any) -> None:
         super().save_overload(sig, data)

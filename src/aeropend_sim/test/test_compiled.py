@@ -86,6 +86,20 @@ def test_what_is_unchanged_is_loaded_and_old_versions_do_not_pile_up(tree):
     assert cached(folder) == kept
 
 
+def test_two_processes_that_compile_at_once_never_take_each_others_code(tree):
+    (tree / "inner.py").write_text(f"{OURS[0]}\n\n\n{OURS[1]}\ndef doubled(x):\n    return 2 * x\n")
+    whole, real = (f"from aeropend_sim.inner import doubled; print(doubled({x}))" for x in (3, 1.5))
+    folder = tree / "__pycache__"
+    assert output(tree, whole) == "6"
+    of_whole = {path: path.read_bytes() for path in folder.glob("inner.doubled-*.nbc")}
+    for path in folder.glob("inner.doubled-*.nbi"):  # the second process read the index before the first one wrote it
+        path.unlink()
+    assert output(tree, real) == "3.0"
+    for path, code in of_whole.items():  # and the first process writes its code last
+        path.write_bytes(code)
+    assert output(tree, real) == "3.0"
+
+
 def test_the_users_own_cache_folder_is_used_and_a_read_only_source_has_its_cache_elsewhere(tree, tmp_path):
     write_pair(tree, 2.0)
     named = tmp_path / "named"
