@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from commands import Command
 
+from aeropend_ident.commands.identify import lines
+from aeropend_ident.identification.identify import Identified
 from aeropend_ident.testing.rigs import BENCH
 from aeropend_sim.model import parameters, rig
 from aeropend_sim.model.excitation import Excitation
@@ -68,6 +70,12 @@ def test_the_equations_of_a_rig_are_found_through_its_measurement_chain(identifi
         assert body["free_run"][channel]["gap"] < 2.0 * body["free_run"][channel]["floor"]
     assert set(body["held_out_mse"]) == {"theta", "theta_dot", "i_a", "omega"}
     assert (out / "identified.svg").read_text().startswith("<svg ")
+
+
+def test_a_state_is_printed_by_its_definition_where_the_candidate_terms_lack_it():
+    found = Identified("weak", ("sin(theta)",), {"theta": {"theta_dot": 1.0}}, {"theta": {"theta_dot": 0.0}}, {}, (),
+                       (), {}, {}, 1, 0.0, ())
+    assert lines(found) == ["d(theta)/dt = 1 theta_dot"]
 
 
 def test_bad_input_gives_one_line_and_no_numbers(bag, made, tmp_path):

@@ -56,3 +56,8 @@ def test_methods_give_the_same_result_in_any_order():
 def test_an_unknown_variable_is_named_with_those_of_the_user(measured):
     with pytest.raises(TermError, match="known: theta, theta_dot, i_a, omega, v_a"):
         Problem(measured.data, ["phi"])
+
+
+def test_a_term_that_is_too_large_to_compute_with_is_refused(measured):
+    with pytest.raises(TermError, match=r"'omega\^300' is too large"):
+        Problem(measured.data, ["omega", "omega^300"])

@@ -70,7 +70,8 @@ def lines(found: Identified) -> list[str]:
             for s, term, often in found.unstable]
     discrepancy = found.method.startswith("discrepancy")
     for s, equation in found.equations.items():
-        ordered = sorted(equation, key=list(found.terms).index)
+        own = [term for term in equation if term not in found.terms]  # by the definition of a state
+        ordered = sorted(equation, key=[*own, *found.terms].index)
         text = " ".join(_term(found, s, term) for term in ordered).removeprefix("+ ")
         out.append(f"to add to d({s})/dt: {text or 'nothing'}" if discrepancy else f"d({s})/dt = {text or '0'}")
     for channel, run in found.free_run.items():

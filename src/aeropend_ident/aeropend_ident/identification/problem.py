@@ -82,9 +82,13 @@ class Problem:
             known: equations to which terms are added (discrepancy); None: all terms are to be found.
             weak: whether the regression is the weak form; otherwise it is SINDy.
             derivative: how SINDy takes derivatives (`sindy.DERIVATIVES`).
+
+        Raises:
+            TermError: a term cannot be read, or is too large.
         """
         self.data, self.names, self.weak, self.derivative = data, names, weak, derivative
         self._narrow = Library.of(data.variables, names)  # first: its message lists the variables that the user has
+        self._narrow.check(np.column_stack([data.values, data.held]))
         n = len(data.states)
         exact: dict[int, dict[str, float]] = {
             data.states.index(s[: -len(dataset.RATE)]): {s: 1.0} for s in data.derived

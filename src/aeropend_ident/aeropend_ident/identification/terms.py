@@ -21,6 +21,9 @@ from aeropend_sim.errors import UserError
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+LARGEST = 1e100
+"""Greatest value of a term (choice: sums of its squares are still numbers)."""
+
 POWER, SIN, COS, ABS, SIGN = range(5)
 _FUNCTIONS = {"sin": SIN, "cos": COS, "abs": ABS, "sign": SIGN}
 _FACTOR = re.compile(r"(?:(?P<call>[a-z]+)\((?P<inner>\w+)\)|(?P<name>[A-Za-z_]\w*))(?:\^(?P<power>[0-9.]+))?$")
@@ -91,6 +94,21 @@ class Library:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def check(self, values: Array) -> None:
+        """Make sure that the terms are numbers to compute with.
+
+        Args:
+            values: (N, len(variables)) the variables.
+
+        Raises:
+            TermError: a term is too large.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):
+            large = ~(np.abs(self(values)) <= LARGEST).all(axis=0)
+        if large.any():
+            raise TermError(f"the term '{self.names[int(np.argmax(large))]}' is too large to compute with where this "
+                            "recording goes: give smaller powers")
 
     def __call__(self, values: Array) -> Array:
         """Values (N, terms) of the terms for variables (N, len(variables))."""
