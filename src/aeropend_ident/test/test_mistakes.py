@@ -120,6 +120,11 @@ def test_a_motor_that_runs_while_the_duty_stays_at_0_is_refused(columns):
     assert mistakes.found(c, still, SAMPLE_PERIOD, BENCH) == []
 
 
+def test_a_rotor_that_runs_up_under_the_duty_of_the_first_sample_is_no_mistake():
+    duty = np.full(4000, 0.45)
+    assert mistakes.found(rig.record(drawn_rig(31, {}), duty, 31)[0], duty, SAMPLE_PERIOD, BENCH) == []
+
+
 @pytest.mark.parametrize("missing", [(), ("v_a",)])
 def test_a_duty_that_is_stamped_late_is_a_note(missing):
     c = drawn(31, duration=20.0)

@@ -99,7 +99,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--material", type=between(0.0, 1.0, "a share"), default=MATERIAL_SHARE, metavar="SHARE",
                         help="share of the gap from which an effect is claimed; smaller ones are listed as small "
                              f"(default: {MATERIAL_SHARE:g})")
-    parser.add_argument("--seconds", type=between(0.0, 1e6, "a time", " s"), metavar="S",
+    parser.add_argument("--seconds", type=between(0.0, 1e6, "a time", "s"), metavar="S",
                         help="how long the search for effects may take (default: a number of simulations bounds it for "
                              "uncalibrated rigs); a note tells if more time could change the verdict")
     parser.add_argument("--effects", action="append", default=[], metavar="FILE",

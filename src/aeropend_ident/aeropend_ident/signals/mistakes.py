@@ -77,6 +77,9 @@ Measured: of 120 rigs of the blind check the least is 0.83."""
 DRIVEN = 0.2
 """Share of the voltage, or speed, of full duty by which they vary only if the duty does (choice: no supply sags so)."""
 
+RUN_UP = 3.0
+"""[s] Time after the first sample in which a rotor may still run up or down (choice: that of a large rotor)."""
+
 STILL = 0.01
 """Width of the levels of the duty (choice)."""
 
@@ -203,7 +206,7 @@ def found(readings: Mapping[str, Array], duty: Array, period: float, model: Mode
     """
     if not np.isfinite(duty).all() or len(duty) < LEAST:
         return []
-    if (wrong := _not_the_duty(readings, duty, model)) is not None:
+    if (wrong := _not_the_duty(readings, duty, period, model)) is not None:
         return [wrong]
     simulated = record(model, duty, period=period)[0]
     if (name := _exchanged_with_duty(readings, duty, period, model, simulated)) is not None:
@@ -228,13 +231,14 @@ def found(readings: Mapping[str, Array], duty: Array, period: float, model: Mode
     return [one for one in out if one is not None]
 
 
-def _not_the_duty(readings: Mapping[str, Array], duty: Array, model: Model) -> Mistake | None:
-    """Whether the motor is driven although the duty (N,) stays where it is."""
+def _not_the_duty(readings: Mapping[str, Array], duty: Array, period: float, model: Model) -> Mistake | None:
+    """Whether the motor is driven although the duty (N,) stays where it is; a rotor runs up, or down, at first."""
     if np.ptp(duty) >= STILL:
         return None
     full = float(voltage(model.model, 1.0))
     for name, most in (("v_a", full), ("omega", full / model.model["K_e"])):
-        known = readings[name][np.isfinite(readings[name])]
+        later = readings[name][round(RUN_UP / period):]
+        known = later[np.isfinite(later)]
         if len(known) >= LEAST and (span := _span(known)) > DRIVEN * most:
             return Mistake(f"the duty stays at {float(duty[-1]):.2g}, but the {NAMES[name]} varies by {span:.3g} "
                            f"{OWN[name]}: another duty drove the motor; record armature or duty_command with it",
