@@ -186,6 +186,14 @@ def test_the_scales_do_not_matter_for_what_a_column_is():
     assert (one.block, one.holds, one.rough, one.noisy) == (other.block, other.holds, other.rough, other.noisy)
 
 
+@pytest.mark.parametrize("odd", [1e300, -1.7e308, 5e-324])
+def test_numbers_that_can_be_no_reading_change_no_guess(odd):
+    rows = np.arange(len(LONG)) % 97 == 50
+    columns = {"t": LONG, "angle": np.where(rows, odd, DRIVEN), "pwm": np.where(rows, odd, PUSH)}
+    with np.errstate(all="raise"):
+        assert [g.quantity for g in found(**columns)[0].values()] == ["time", "theta", "duty"]
+
+
 @pytest.mark.parametrize(("name", "quantity"), [
     ("theta_ref", "reference"), ("Winkelgeschwindigkeit", "angle rate"), ("θ", "theta"), ("pwmOut", "duty"),
     ("kąt", "theta"), ("Führungsgröße", "reference"), ("angle_filt", "filtered"), ("battery", "supply"),

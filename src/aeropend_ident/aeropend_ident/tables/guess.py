@@ -116,6 +116,7 @@ def log_odds(table: Table) -> float:
 
 def _guess(table: Table, given: Given) -> tuple[list[Guess], float]:
     """A guess for each column, and the log odds of time, angle and command together."""
+    table = table.possible()
     seen = look_at(table)
     found = [_nothing(one) for one in seen]
     clock, odds = _clock(table, seen, found)
@@ -142,6 +143,7 @@ def _nothing(one: Seen) -> Guess:
 
 def time_of(table: Table) -> tuple[int, float | None] | None:
     """The column of the time, and the size of its unit [s], None if that is not clear; None without a time."""
+    table = table.possible()
     seen = look_at(table)
     found = [_nothing(one) for one in seen]
     k, _ = _clock(table, seen, found)

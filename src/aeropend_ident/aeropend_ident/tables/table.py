@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,9 @@ MOST_COLUMNS = 1000
 
 SHOWN = 3
 """Number of cells of a column that are kept as text, to show them."""
+
+LEAST, MOST = 1e-30, 1e30
+"""Amounts between which a number may be a reading, in whatever unit (choice: products of four are still numbers)."""
 
 
 class TableError(UserError):
@@ -86,6 +89,12 @@ class Table:
     def __len__(self) -> int:
         """Return the number of rows."""
         return len(self.lines)
+
+    def possible(self) -> Table:
+        """The table without the numbers that can be no reading, whatever their unit."""
+        x = [np.where(np.abs(c.values) < LEAST, 0.0, c.values) for c in self.columns]
+        return replace(self, columns=tuple(replace(c, values=np.where(np.abs(v) <= MOST, v, np.nan))
+                                           for c, v in zip(self.columns, x, strict=True)))
 
     def label(self, number: int) -> str:
         """Text for a column (number from 0) in a message: '2 "angle [deg]"', or '2' without a name."""
