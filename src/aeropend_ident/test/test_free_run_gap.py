@@ -38,3 +38,15 @@ def test_a_run_that_gives_no_number_has_no_gap_and_no_warning():
     signals = recorded(21, duration=8.0)
     nothing = {c: np.full(len(signals), np.nan) for c in ("theta", "omega", "i_a", "v_a")}
     assert np.isnan(gap(nothing, signals, signals.train, len(signals)).total)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("end", [np.nan, np.inf, 1e300])
+def test_a_run_that_diverges_at_its_end_has_no_gap(end):
+    signals = recorded(21, duration=8.0)
+    run = {c: np.nan_to_num(signals.channel(c)) for c in ("theta", "omega", "i_a", "v_a")}
+    run["theta"][-3:] = end
+    found = gap(run, signals, signals.train, len(signals))
+    assert np.isnan(found.rms["theta"])
+    assert np.isfinite(found.rms["i_a"])
+    assert np.isfinite(found.windows).all()

@@ -256,7 +256,7 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     if found.unknown is not None and gap_share.headline(
             parts, gap_share.shares(parts), settings.material).verdict == gap_share.UNKNOWN:
         found, joint, gaps, parts = _with_learned_term(fitted, found, joint, gaps, parts, settings, progress)
-    if found.stages is not before[0].stages and gap_before <= gaps.after.total:
+    if found.stages is not before[0].stages and not gaps.after.total < gap_before:
         found, joint, gaps, parts = before  # what was taken back predicts as well as what can be learned in its place
     conclusions = _conclude(found, joint, gaps, parts, settings)
     model, chains = found.chains.model, found.chains
@@ -311,7 +311,7 @@ def _without_harmful(fitted: CutChains, found: _Findings, joint: JointFit, gaps:
     while harmful := [p for p in parts if p.amount < 0.0 and p.name not in needed]:
         name = min(harmful, key=lambda p: p.amount).name
         without = _fit_and_measure(fitted, _without(found, name), progress)
-        if without[2].after.total > gaps.after.total:
+        if not without[2].after.total <= gaps.after.total:
             needed.add(name)  # nominal numbers could take its part over only against what is known of them
             continue
         found, joint, gaps = without
@@ -333,7 +333,7 @@ def _with_learned_term(fitted: CutChains, found: _Findings, joint: JointFit, gap
     placed = replace(unknown, term=replace(unknown.term, place=learned.place))
     with_ = replace(found, stages=stages, unknown=placed, learned=learned)
     with_, joint_with, gaps_with = _fit_and_measure(fitted, with_, progress)
-    if gaps_with.after.total >= gaps.after.total:
+    if not gaps_with.after.total < gaps.after.total:
         effect_file.forget(learned.id)
         return found, joint, gaps, parts
     return with_, joint_with, gaps_with, _parts(with_, joint_with, gaps_with, settings.jobs)

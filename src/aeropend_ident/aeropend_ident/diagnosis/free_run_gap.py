@@ -17,6 +17,7 @@ from aeropend_ident.signals.pulses import mean_speed
 from aeropend_ident.signals.signals import CHANNELS, FEWEST, Signals
 from aeropend_sim.model import actuator, dynamics, sensing
 from aeropend_sim.model.parameters import Model
+from aeropend_sim.readings import MOST
 
 Array = NDArray[np.float64]
 
@@ -141,7 +142,7 @@ class Gap:
 
 def gap(readings: Mapping[str, Array], signals: Signals, start: int, stop: int,
         left_out: NDArray[np.bool_] | None = None) -> Gap:
-    """The gap between readings of a model and a recording.
+    """The gap between readings of a model and a recording; NaN in a channel of a run that diverges.
 
     Args:
         readings: channel -> (N,).
@@ -159,7 +160,9 @@ def gap(readings: Mapping[str, Array], signals: Signals, start: int, stop: int,
         if known.sum() < FEWEST:
             continue
         error = np.where(known, readings[channel][start:stop] - measured, np.nan)
-        rms[channel] = float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else math.nan  # it diverges
+        if not (np.abs(error[known]) <= 2.0 * MOST[channel]).all():  # the run diverges
+            error[:] = np.nan
+        rms[channel] = float(np.sqrt(np.mean(error[known] ** 2)))
         everywhere = float(np.nanstd(signals.channel(channel)))
         here = float(np.std(measured[known]))
         spread[channel] = max(here if here > AT_REST * everywhere else everywhere, signals.sigma[channel], 1e-12)
