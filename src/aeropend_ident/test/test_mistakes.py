@@ -36,6 +36,7 @@ SURE = {
     "current and voltage": lambda c: {"i_a": c["v_a"], "v_a": c["i_a"]},
     "angle and speed": lambda c: {"theta": c["omega"], "omega": c["theta"]},
     "duty and current": lambda c: {"duty": c["i_a"], "i_a": c["duty"]},
+    "duty turned over": lambda c: {"duty": -c["duty"]},
     "percent": lambda c: {"duty": 100.0 * c["duty"]},
     "rpm": lambda c: {"omega": c["omega"] * 60.0 / (2.0 * np.pi)},
     "turns a second": lambda c: {"omega": c["omega"] / (2.0 * np.pi)},
@@ -118,6 +119,12 @@ def test_a_motor_that_runs_while_the_duty_stays_at_0_is_refused(columns):
         assert words in one.what
     c = rig.record(drawn_rig(31, {}), still, 31)[0]
     assert mistakes.found(c, still, SAMPLE_PERIOD, BENCH) == []
+
+
+def test_a_duty_that_is_inverted_is_refused_although_no_command_mends_it(columns):
+    (one,) = mistakes.found(columns, 1.0 - columns["duty"], SAMPLE_PERIOD, BENCH)
+    assert (one.sure, one.options) == (True, ())
+    assert "inverted (the rig follows 1 - duty)" in one.what
 
 
 def test_a_rotor_that_runs_up_under_the_duty_of_the_first_sample_is_no_mistake():

@@ -212,6 +212,8 @@ def found(readings: Mapping[str, Array], duty: Array, period: float, model: Mode
     if (name := _exchanged_with_duty(readings, duty, period, model, simulated)) is not None:
         return [Mistake(f"it looks as if duty and {NAMES[name]} are exchanged (the rig follows {name} as its duty)",
                         sure=True, options=(f"--duty {name}:1", f"--{OPTIONS[name]} duty:{OWN[name]}"))]
+    if (wrong := _turned_duty(readings, duty, period, model, simulated)) is not None:
+        return [wrong]
     pairs = {}
     for name in OWN:
         x, y = simulated[name], readings[name]
@@ -257,6 +259,21 @@ def _exchanged_with_duty(readings: Mapping[str, Array], duty: Array, period: flo
         other = record(model, x, period=period)[0]
         if _largest_error({**readings, name: duty}, other) < min(FITS, own / BETTER):
             return name
+    return None
+
+
+def _turned_duty(readings: Mapping[str, Array], duty: Array, period: float, model: Model,
+                 simulated: Mapping[str, Array]) -> Mistake | None:
+    """Whether the rig follows the duty turned over, or what the duty lacks to 1."""
+    own = _largest_error(readings, simulated)
+    if np.ptp(duty) < STILL or not own > FITS:
+        return None
+    for other, what, options in (
+            (-duty, "turned over (the rig follows it with the other sign)", ("--duty duty:-100%",)),
+            (1.0 - duty, "inverted (the rig follows 1 - duty): publish 1 - duty, or record again", ())):
+        if np.abs(other).max() <= 1.0 and _largest_error(
+                readings, record(model, other, period=period)[0]) < min(FITS, own / BETTER):
+            return Mistake(f"it looks as if the duty is {what}", sure=True, options=options)
     return None
 
 
