@@ -158,6 +158,16 @@ def test_a_lag_that_differs_between_rise_and_fall_is_found():
     assert body["channels"]["theta"]["fit_unseen"] > 0.95
 
 
+def test_little_is_simulated_once_the_time_is_up(monkeypatch):
+    runs, run_arm = [], dynamics.run_arm
+    monkeypatch.setattr(dynamics, "run_arm", lambda *arguments: runs.append(1) or run_arm(*arguments))
+    found = diagnose(BENCH, [driven(effects={"coulomb_friction": {"accel": 0.8}})], 1, fit_nominal=True, seconds=0.0)
+    assert len(runs) < 1000  # six thousand without a limit
+    assert any(note.startswith("the nominal model was identified without dry friction")
+               for note in found.signals[0].notes)
+    assert found.body["which"]["verdict"] == "cannot_tell"
+
+
 def test_an_arm_that_rests_at_first_gives_its_zero_to_a_reading():
     s = driven()
     rest = round(0.5 / s.period)

@@ -100,8 +100,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
                         help="share of the gap from which an effect is claimed; smaller ones are listed as small "
                              f"(default: {MATERIAL_SHARE:g})")
     parser.add_argument("--seconds", type=between(0.0, 1e6, "a time", "s"), metavar="S",
-                        help="how long the search for effects may take (default: a number of simulations bounds it for "
-                             "uncalibrated rigs); a note tells if more time could change the verdict")
+                        help="how long identification and search may take; what has begun is brought to an end, and a "
+                             "note tells if more time could change the verdict (default: a number of simulations "
+                             "bounds the search for uncalibrated rigs)")
     parser.add_argument("--effects", action="append", default=[], metavar="FILE",
                         help="effect file: effects by formula that are tried beside those of the catalogue; may be "
                              "given several times")

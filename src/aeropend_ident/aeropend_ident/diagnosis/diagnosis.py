@@ -57,6 +57,7 @@ from aeropend_ident.diagnosis.search.learned_term import Learned, learn
 from aeropend_ident.diagnosis.search.onset import Onset
 from aeropend_ident.diagnosis.search.search import refit, search, trifling_gap, unsearched
 from aeropend_ident.diagnosis.search.unknown_effect import UnknownEffect
+from aeropend_ident.estimation.map_fit import passed
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import CHANNELS, Signals
 from aeropend_ident.signals.statistics import rms
@@ -69,6 +70,8 @@ Array = NDArray[np.float64]
 
 CUT_SHORT = ("the search was cut short to bound its time: an effect beside the first, or a rival close to it, may have "
              "been missed; --seconds says how long it may take")
+
+NOT_LEARNED = "the missing term was not learned, to bound the time: with more --seconds it is"
 
 
 CHANGED = 1.5
@@ -123,11 +126,13 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
         progress: called as the work goes on.
         fit_nominal: whether the rig is uncalibrated: its parameters are known to a factor of three at best.
         material: share of the gap from which an effect is claimed.
-        seconds: [s] that the search may take; None: a budget of simulations bounds it where it may be long.
+        seconds: [s] that identification and search may take; what has begun is brought to an end. None: a budget of
+            simulations bounds the search where it may be long.
         known: what earlier verdicts of the rig know of the model; the verdict is then what has changed.
         further: ids of effects of effect files that are tried beside those of the catalogue.
         left_out: ids of fitted effects that are not tried; not of those that only statistics show.
     """
+    deadline = None if seconds is None else time.monotonic() + seconds
     with threadpool_limits(1):  # the matrices are narrow: threads of the linear algebra would slow each other down
         policy = policy_of(recordings, fit_nominal=fit_nominal)
         likely: dict[str, float] = {}
@@ -139,16 +144,16 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
                 model = replace(model, model={**model.model, "reverse": 1.0})
             recordings = mounted(model, recordings)
         if policy.wide_search and angle_only(recordings):
-            rig = fit_driven_rig(model, recordings)
+            rig = fit_driven_rig(model, recordings, deadline)
             found, likely = without_findings(rig.model, model, recordings, material)
             model, plain, notes = replace(found, name=f"{model.name}, identified"), rig.plain, rig.notes
         elif fit_nominal:
-            model, recordings = fit_nominal_model(model, recordings)
+            model, recordings = fit_nominal_model(model, recordings, deadline)
         kind = CutChains if policy.calibrated else CachedChains
         chains = with_pwm_timing(kind(model, recordings, policy))
         chains.likely, chains.plain, chains.notes, chains.known = likely, plain, notes, known
         chains.further, chains.left_out = tuple(further), tuple(left_out)
-        return _diagnose(chains, Settings(jobs, material, seconds), progress)
+        return _diagnose(chains, Settings(jobs, material, deadline), progress)
 
 
 @dataclass(frozen=True)
@@ -158,12 +163,13 @@ class Settings:
     Attributes:
         jobs: threads.
         material: share of the gap from which an effect is claimed.
-        seconds: [s] that the search may take; None: a budget of simulations bounds it where it may be long.
+        deadline: [s] of `time.monotonic` after which nothing more is looked for; None: a budget of simulations bounds
+            the search where it may be long.
     """
 
     jobs: int = 1
     material: float = MATERIAL_SHARE
-    seconds: float | None = None
+    deadline: float | None = None
 
 
 @dataclass(frozen=True)
@@ -255,7 +261,10 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
         parts = _parts(found, joint, gaps, settings.jobs)
     if found.unknown is not None and gap_share.headline(
             parts, gap_share.shares(parts), settings.material).verdict == gap_share.UNKNOWN:
-        found, joint, gaps, parts = _with_learned_term(fitted, found, joint, gaps, parts, settings, progress)
+        if passed(settings.deadline):
+            found = replace(found, recordings=[s.noted(NOT_LEARNED) for s in found.recordings])
+        else:
+            found, joint, gaps, parts = _with_learned_term(fitted, found, joint, gaps, parts, settings, progress)
     if found.stages is not before[0].stages and not gaps.after.total < gap_before:
         found, joint, gaps, parts = before  # what was taken back predicts as well as what can be learned in its place
     conclusions = _conclude(found, joint, gaps, parts, settings)
@@ -387,14 +396,16 @@ def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Finding
     if not fitted.policy.driven:  # a decay has few swings: effects are selected on all of them
         chains = CutChains(fitted.model, [replace(s, train=len(s)) for s in recordings], fitted.policy)
         chains.further, chains.left_out = fitted.further, fitted.left_out
-    deadline = None if settings.seconds is None else time.monotonic() + settings.seconds
+    deadline = settings.deadline
 
     def searched(chains: CutChains) -> dict[str, Findings]:
         return search(chains, settings.jobs,
                       lambda stage, share: progress(f"searching effects of the {stage}", 0.7 * share), deadline,
                       trifle)
 
-    chains, stages, begun = onset.search_within_windows(chains, searched(chains), searched)
+    stages, begun = searched(chains), None
+    if not passed(deadline):
+        chains, stages, begun = onset.search_within_windows(chains, stages, searched)
     recordings = [replace(s, window=c.window).noted(*fitted.notes)
                   for s, c in zip(recordings, chains.recordings, strict=True)]
     if any(f.cut_short for f in stages.values()):
@@ -433,7 +444,7 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
     calibrated = chains.policy.calibrated
     share = gap_share.shares(parts)
     head = gap_share.headline(parts, share, settings.material)
-    failed = found.failed or _why_not_predicted(chains, gaps)
+    failed = found.failed or _why_untried(stages, head.verdict) or _why_not_predicted(chains, gaps)
     if head.verdict == "none" and not calibrated:
         failed = failed or gap_share.why_unsure(share, settings.material)
     if failed:
@@ -478,6 +489,14 @@ def _unlearned(values: Mapping[str, float], learned: Learned | None) -> dict[str
 
 def _families(ids: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(family(id_) for id_ in ids))
+
+
+def _why_untried(stages: Mapping[str, Findings], verdict: str) -> str:
+    """Why neither "none" nor "unknown" can be said: no effect of some stage was tried; "" if they were."""
+    untried = [stage for stage, f in stages.items() if f.cut_short and not f.found and not f.rivals]
+    if not untried or verdict not in ("none", gap_share.UNKNOWN):
+        return ""
+    return f"the time was up before any effect of the {' and of the '.join(untried)} was tried: give more --seconds"
 
 
 def _why_not_predicted(chains: CutChains, gaps: _Gaps) -> str:

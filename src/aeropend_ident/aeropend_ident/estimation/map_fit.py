@@ -23,6 +23,7 @@ the weights are renewed, and solves for the bounds more exactly than is needed h
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -304,18 +305,21 @@ class Search:
         pushed = ((z <= self.low) & (gradient > 0.0)) | ((z >= self.high) & (gradient < 0.0))
         return ~pushed
 
-    def improve(self, steps: int) -> tuple[Array, Products]:
+    def improve(self, steps: int, deadline: float | None = None) -> tuple[Array, Products]:
         """Take Levenberg-Marquardt steps with the weights as they are.
 
         Args:
             steps: at most.
+            deadline: after it, only one; see `passed`.
 
         Returns:
             Information matrix and products of the last `normal_equations`.
         """
         damping = DAMPING
         information, products = self.prior, Products()
-        for _ in range(steps):
+        for done in range(steps):
+            if done and passed(deadline):
+                break
             if not self.slopes:
                 self.slopes, self.fresh = self.differences(), True
             r = self.stack(self.current)
@@ -365,7 +369,7 @@ def prior_information(parameters: Sequence[Parameter]) -> Array:
 
 
 def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter],
-        rounds: int = 10, steps: int = 4, least_ess: float = 0.0) -> Fit:
+        rounds: int = 10, steps: int = 4, least_ess: float = 0.0, deadline: float | None = None) -> Fit:
     """MAP fit with the noise inflated to the residual; see the module.
 
     Args:
@@ -375,11 +379,14 @@ def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence
         steps: Levenberg-Marquardt steps in each round.
         least_ess: effective sample size that a channel counts for at least during the search. A slow drift has a small
             one; with wide priors the search would then stay near their means.
+        deadline: after it, the fit ends with its next step; see `passed`.
     """
     search = Search(residuals, parameters, least_ess)
     information, products = search.prior, Products()
-    for _ in range(rounds):
-        information, products = search.improve(steps)
+    for done in range(rounds):
+        if done and passed(deadline):
+            break
+        information, products = search.improve(steps, deadline)
         before = search.weight
         search.renew_weights()
         changed = sum(abs(search.weight[k] - before[k]) >= WEIGHT_CHANGE * before[k] for k in before)
@@ -391,6 +398,11 @@ def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence
                                                                          strict=True)}
     log_prior = 0.5 * float(np.linalg.slogdet(search.prior)[1] - z @ search.prior @ z)
     return Fit(values, sd, search.current, search.scale, search.ess, log_prior, products, search.prior)
+
+
+def passed(deadline: float | None) -> bool:
+    """Whether it is later than an instant [s] of `time.monotonic`; never if there is none."""
+    return deadline is not None and time.monotonic() > deadline
 
 
 def finite(r: Array, largest: float = LARGEST) -> Array:

@@ -32,7 +32,7 @@ from aeropend_ident.diagnosis.chain.values import FILTER, absent_at, of_rig, wit
 from aeropend_ident.diagnosis.chain.weak_start import WeakForm, downsampled, likeliest
 from aeropend_ident.diagnosis.document import Lift
 from aeropend_ident.diagnosis.policy import UNCALIBRATED
-from aeropend_ident.estimation.map_fit import ENOUGH, Fit, Search, Sensitivities, fit, largest_ess
+from aeropend_ident.estimation.map_fit import ENOUGH, Fit, Search, Sensitivities, fit, largest_ess, passed
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import actuator, dynamics
@@ -80,6 +80,9 @@ CURVE = 11
 """Points of the static curve from duty to lift that is reported (choice).
 
 Measured: at ±30 % no verdict of 3 recordings changes (docs/results/thresholds.md)."""
+
+PLAIN = ("the nominal model was identified without dry friction, delay, second lag and the exponent of the thrust, to "
+         "bound the time: with more --seconds they are tried")
 
 LAGS = {"command_delay": "delay", "thrust_lag": "tau"}
 """Effects of `CHOSEN` that put the lift off, and their sizes: each may stand in for the other."""
@@ -136,22 +139,29 @@ class DrivenRig:
     notes: tuple[str, ...] = ()
 
 
-def fit_driven_rig(model: Model, recordings: Sequence[Signals]) -> DrivenRig:
+def fit_driven_rig(model: Model, recordings: Sequence[Signals], deadline: float | None = None) -> DrivenRig:
     """Identify the nominal model from angle and command.
 
     Args:
         model: gives what the recordings cannot determine.
         recordings: of one rig.
+        deadline: [s] of `time.monotonic` after which no further term is looked for.
     """
     units = units_of(model, recordings)
     scaled = [downsampled(units.of(s), dynamics.LONGEST_STEP) for s in recordings]
     begun = units.model(model)
-    full, plain = _searched(begun, scaled, keep=model.effects)
-    chosen = _refined(begun, _chosen(full, scaled, model.effects), scaled, model.effects)
+    full, plain = _searched(begun, scaled, model.effects, deadline)
+    chosen = None if full is None else _chosen(full, scaled, model.effects, deadline)
+    if chosen is None:
+        found = units.model(plain, back=True)
+        f = fit_own(found, recordings, deadline=deadline)
+        found = with_values(found, of_rig(f.values))
+        return DrivenRig(found, found, (PLAIN,))
+    chosen = _refined(begun, chosen, scaled, model.effects, deadline)
     found = units.model(chosen.model, back=True)
-    f = fit_own(found, recordings)
-    return DrivenRig(with_values(found, of_rig(f.values)), _rescaled(units.model(plain, back=True), found),
-                     _delay_or_lag(chosen, scaled, keep=model.effects))
+    f = fit_own(found, recordings, deadline=deadline)
+    notes = () if passed(deadline) else _delay_or_lag(chosen, scaled, keep=model.effects)
+    return DrivenRig(with_values(found, of_rig(f.values)), _rescaled(units.model(plain, back=True), found), notes)
 
 
 def _rescaled(plain: Model, found: Model) -> Model:
@@ -214,8 +224,9 @@ def units_of(model: Model, recordings: Sequence[Signals]) -> Units:
     return Units(min(found)[1] if found else 1.0, duty)
 
 
-def _searched(model: Model, recordings: Sequence[Signals], keep: Collection[str]) -> tuple[Candidate, Model]:
-    """The best fit with every term, and the best model without any.
+def _searched(model: Model, recordings: Sequence[Signals], keep: Collection[str], deadline: float | None
+              ) -> tuple[Candidate | None, Model]:
+    """The best fit with every term, None if there is no time for it; and the best model without any.
 
     Fits start from each lag, with and without dry friction, over growing horizons.
     """
@@ -226,21 +237,25 @@ def _searched(model: Model, recordings: Sequence[Signals], keep: Collection[str]
     begun = []
     for found in starts:
         best = {s.lag: s.model for s in reversed(found)}
-        if best:
-            begun.append(_over_growing_horizons(list(best.values()), recordings))
-    plain = _fitted(begun[0] if starts[0] else model, recordings, ROUNDS, STEPS)[0]
+        if best and not (begun and passed(deadline)):
+            begun.append(_over_growing_horizons(list(best.values()), recordings, deadline))
+    plain = _fitted(begun[0] if starts[0] else model, recordings, ROUNDS, STEPS, deadline)[0]
+    if passed(deadline):
+        return None, plain
     begun = [plain, *begun[1 if starts[0] else 0:]]
     full = [_with_terms(m, [n for n in CHOSEN if not refines(n)]) for m in begun]
-    m, f = min((_fitted(m, recordings, ROUNDS, STEPS) for m in full), key=lambda e: e[1].mean_square)
-    return Candidate(m, f, _error(m, recordings, f)), plain
+    m, f = min((_fitted(m, recordings, ROUNDS, STEPS, deadline) for m in full), key=lambda e: e[1].mean_square)
+    return None if passed(deadline) else Candidate(m, f, _error(m, recordings, f)), plain
 
 
-def _over_growing_horizons(begun: list[Model], recordings: Sequence[Signals]) -> Model:
-    """The best of some starts after fits over the beginning, then over more and more of the recordings."""
+def _over_growing_horizons(begun: list[Model], recordings: Sequence[Signals], deadline: float | None) -> Model:
+    """The best of some starts after fits over the beginning, then over more and more, while there is time."""
     for share, many in zip(HORIZONS, FOLLOWED, strict=True):
         least = round(SHORTEST_HORIZON / recordings[0].period)
         part = [replace(s, train=min(max(round(share * s.train), least), s.train)) for s in recordings]
-        fits = sorted((_fitted(m, part, 2, STEPS) for m in begun), key=lambda f: f[1].mean_square)
+        if passed(deadline):
+            break
+        fits = sorted((_fitted(m, part, 2, STEPS, deadline) for m in begun), key=lambda f: f[1].mean_square)
         begun = [m for m, _ in fits[:many]]
     return begun[0]
 
@@ -260,7 +275,8 @@ def _with_terms(m: Model, names: Sequence[str]) -> Model:
     return with_values(m, {n: _first_size(n, m) for n in names if key(n).owner not in m.effects or refines(n)})
 
 
-def _refined(model: Model, best: Candidate, recordings: Sequence[Signals], keep: Collection[str]) -> Candidate:
+def _refined(model: Model, best: Candidate, recordings: Sequence[Signals], keep: Collection[str],
+             deadline: float | None) -> Candidate:
     """Add what refines a term, with that term, where a cross-validated free run needs it.
 
     All else is then searched again: without it, the static curve had to stand in for it.
@@ -268,13 +284,14 @@ def _refined(model: Model, best: Candidate, recordings: Sequence[Signals], keep:
     for name in filter(refines, CHOSEN):
         owner = key(name).owner
         terms = [f"{owner}.{DEFINED[owner].size}", name]
-        if owner in keep:
+        if owner in keep or passed(deadline):
             continue
         tried = _candidate(_with_terms(best.model, terms), recordings)
         if best.error > NEEDED * tried.error and not any(_absent(tried, term) for term in terms):
             begun = model.with_effects({**model.effects, owner: tried.model.effects[owner]})
-            again = _chosen(_searched(begun, recordings, keep)[0], recordings, keep)
-            best = min(tried, again, key=lambda c: c.error)
+            full = _searched(begun, recordings, keep, deadline)[0]
+            again = None if full is None else _chosen(full, recordings, keep, deadline)
+            best = min((c for c in (tried, again) if c is not None), key=lambda c: c.error)
     return best
 
 
@@ -284,9 +301,10 @@ def _absent(c: Candidate, name: str) -> bool:
     return abs(size - absent_at(name)) < NOTHING * abs(_usual(name, c.model))
 
 
-def _chosen(best: Candidate, recordings: Sequence[Signals], keep: Collection[str]) -> Candidate:
-    """Take out the terms that a cross-validated free run does not need, the least needed first."""
-    while True:
+def _chosen(best: Candidate, recordings: Sequence[Signals], keep: Collection[str], deadline: float | None
+            ) -> Candidate | None:
+    """Take out the terms that a cross-validated free run does not need, the least needed first; None: no time."""
+    while not passed(deadline):
         terms = [name for name in held(best.model) if key(name).owner not in keep]
         gone = [name for name in terms if _absent(best, name)]
         fewer = [_without(best, recordings, name) for name in gone[:1] or terms]
@@ -294,6 +312,7 @@ def _chosen(best: Candidate, recordings: Sequence[Signals], keep: Collection[str
         if simpler is None or (simpler.error > NEEDED * best.error and not gone):
             return best
         best = simpler
+    return None
 
 
 def _delay_or_lag(best: Candidate, recordings: Sequence[Signals], keep: Collection[str]) -> tuple[str, ...]:
@@ -326,15 +345,18 @@ def _candidate(model: Model, recordings: Sequence[Signals]) -> Candidate:
     return Candidate(m, f, _error(m, recordings, f))
 
 
-def _fitted(model: Model, recordings: Sequence[Signals], rounds: int, steps: int) -> tuple[Model, Fit]:
-    f = fit_own(model, recordings, rounds, steps)
+def _fitted(model: Model, recordings: Sequence[Signals], rounds: int, steps: int, deadline: float | None = None
+            ) -> tuple[Model, Fit]:
+    f = fit_own(model, recordings, rounds, steps, deadline)
     return with_values(model, of_rig(f.values)), f
 
 
-def fit_own(model: Model, recordings: Sequence[Signals], rounds: int = 10, steps: int = 4) -> Fit:
+def fit_own(model: Model, recordings: Sequence[Signals], rounds: int = 10, steps: int = 4,
+            deadline: float | None = None) -> Fit:
     """Fit the parameters of a nominal model, with those of the effects that it holds."""
     chains = CachedChains(model, recordings, UNCALIBRATED)
-    return fit(chains.residuals("arm"), nominal_parameters(chains, "arm"), rounds, steps, UNCALIBRATED.least_ess)
+    return fit(chains.residuals("arm"), nominal_parameters(chains, "arm"), rounds, steps, UNCALIBRATED.least_ess,
+               deadline)
 
 
 def _error(model: Model, recordings: Sequence[Signals], f: Fit) -> float:

@@ -78,12 +78,14 @@ of freedom needed (choice).
 
 Measured: at ±30 % no verdict of 2 recordings changes (docs/results/thresholds.md)."""
 
-def fit_nominal_model(model: Model, recordings: Sequence[Signals]) -> tuple[Model, list[Signals]]:
+def fit_nominal_model(model: Model, recordings: Sequence[Signals], deadline: float | None = None
+                      ) -> tuple[Model, list[Signals]]:
     """Identify the nominal model, with as many free parameters as the channels allow.
 
     Args:
         model: gives what the recordings cannot determine.
         recordings: of one rig.
+        deadline: [s] of `time.monotonic` after which fits end with their next step.
 
     Returns:
         The model, and the recordings with their noise as estimated from the fit.
@@ -91,17 +93,17 @@ def fit_nominal_model(model: Model, recordings: Sequence[Signals]) -> tuple[Mode
     name = f"{model.name}, identified"
     policy = policy_of(recordings, fit_nominal=True)
     if not policy.driven:
-        found, f = _over_growing_horizons(_start_of_decay(model, recordings), recordings)
+        found, f = _over_growing_horizons(_start_of_decay(model, recordings), recordings, deadline)
         chains = CutChains(found, recordings, policy)
         noisier = [_with_local_noise(chain, chains.values_of(f.values, k)) for k, chain in enumerate(chains.each)]
         return replace(found, name=name), noisier
     if angle_only(recordings):
-        rig = fit_driven_rig(model, recordings)
+        rig = fit_driven_rig(model, recordings, deadline)
         return replace(rig.model, name=name), [s.noted(*rig.notes) for s in recordings]
-    return replace(_stage_by_stage(model, recordings, policy), name=name), list(recordings)
+    return replace(_stage_by_stage(model, recordings, policy, deadline), name=name), list(recordings)
 
 
-def _stage_by_stage(model: Model, recordings: Sequence[Signals], policy: Policy) -> Model:
+def _stage_by_stage(model: Model, recordings: Sequence[Signals], policy: Policy, deadline: float | None) -> Model:
     """The nominal model of a rig with more channels than the angle: each stage from its measured input."""
     chains = CutChains(model, recordings, policy)
     for stage in STAGES:
@@ -109,15 +111,17 @@ def _stage_by_stage(model: Model, recordings: Sequence[Signals], policy: Policy)
             chains = _cut_again(chains, _start_of_motor(chains))
         elif stage == "arm":
             chains = _cut_again(chains, _start_of_arm(chains))
-        chains, f = _likelier([chains, *_without_losses(chains)] if stage == "actuator" else [chains], stage)
+        chains, f = _likelier([chains, *_without_losses(chains)] if stage == "actuator" else [chains], stage,
+                             deadline)
         if f.residuals:
             chains = _cut_again(chains, chains.each[0].valued(of_rig(f.values)))
     return chains.model
 
 
-def _likelier(tried: Sequence[CutChains], stage: str) -> tuple[CutChains, Fit]:
+def _likelier(tried: Sequence[CutChains], stage: str, deadline: float | None) -> tuple[CutChains, Fit]:
     """The chains with the largest evidence in a stage, and their fit."""
-    fits = [fit(c.residuals(stage), [replace(p, sd=WIDER * p.sd) for p in nominal_parameters(c, stage)]) for c in tried]
+    fits = [fit(c.residuals(stage), [replace(p, sd=WIDER * p.sd) for p in nominal_parameters(c, stage)],
+                deadline=deadline) for c in tried]
     return max(zip(tried, fits, strict=True), key=lambda pair: pair[1].log_evidence(fits[0].ess))
 
 
@@ -242,13 +246,13 @@ def _with_local_noise(chain: CutChain, values: Mapping[str, float]) -> Signals:
     return replace(s, sigma={**s.sigma, "theta": seen}).noted(said)
 
 
-def _over_growing_horizons(model: Model, recordings: Sequence[Signals]) -> tuple[Model, Fit]:
+def _over_growing_horizons(model: Model, recordings: Sequence[Signals], deadline: float | None) -> tuple[Model, Fit]:
     """Fit over the beginning, then over more and more of the recordings."""
     for share in HORIZONS:
         least = round(SHORTEST_HORIZON / recordings[0].period)
         part = [replace(s, train=min(max(round(share * s.train), least), s.train)) for s in recordings]
         chains = CachedChains(model, part, policy_of(part, fit_nominal=True))
-        f = fit(chains.residuals("arm"), nominal_parameters(chains, "arm"), ROUNDS)
+        f = fit(chains.residuals("arm"), nominal_parameters(chains, "arm"), ROUNDS, deadline=deadline)
         model = chains.each[0].valued(of_rig(f.values))
     return model, f
 

@@ -38,7 +38,7 @@ from aeropend_ident.diagnosis.search.selection import (
     shared,
     squared_gap,
 )
-from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess
+from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess, passed
 from aeropend_ident.estimation.parameter import Parameter, started
 
 FOLLOWS = 0.01
@@ -141,13 +141,14 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
                   acts_on: Mapping[str, tuple[str, ...]], carried: list[Parameter], trifle: float,
                   pool: ThreadPoolExecutor, deadline: float | None) -> Findings:
     nominal: list[Parameter] = [*nominal_parameters(chains, stage), *carried]
-    base = fit(chains.residuals(stage), nominal, least_ess=chains.policy.least_ess)
+    base = fit(chains.residuals(stage), nominal, least_ess=chains.policy.least_ess, deadline=deadline)
     findings = Findings(stage, base, base)
     if not base.residuals:
         return findings
     candidates = [delay_from_voltage(chains, h, base.values) for h in candidates]
     others = {b for h in candidates for b in acts_on[h.family] if b != stage}
-    downstream = {b: fit(chains.residuals(b), nominal_parameters(chains, b), least_ess=chains.policy.least_ess)
+    downstream = {b: fit(chains.residuals(b), nominal_parameters(chains, b), least_ess=chains.policy.least_ess,
+                         deadline=deadline)
                   for b in others}
     known, supported, gained = nominal, findings, 0.0
     while len(findings.found) < MOST_EFFECTS:
@@ -166,7 +167,8 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
     if len(findings.found) > len(supported.found):
         rivals = findings.found[len(supported.found)]
         findings = replace(supported, rivals=rivals, cut_short=findings.cut_short)
-    findings = _with_best_forms(chains, _with_better_rivals(chains, findings, nominal), nominal)
+    if not passed(deadline):
+        findings = _with_best_forms(chains, _with_better_rivals(chains, findings, nominal), nominal)
     return _without_unneeded(chains, findings, nominal)
 
 
@@ -181,19 +183,22 @@ def _select(here: SelectionRound, findings: Findings, candidates: list[Hypothesi
     if policy.budget is not None:
         tried, lead = here.warm_started(tried)
         findings = replace(findings, cut_short=findings.cut_short or here.budget_spent)
+    late = passed(here.deadline)
+    findings = replace(findings, cut_short=findings.cut_short or late)
     rounds = CUT_SHORT_ROUNDS if findings.cut_short else ROUNDS
     tried = here.converged(tried, rounds, but=lead)
-    if not policy.wide_search and not any(passes_as_noise(f, MATERIAL) for _, f in tried):
+    if not late and not policy.wide_search and not any(passes_as_noise(f, MATERIAL) for _, f in tried):
         tried = here.multi_started(tried)
     # a change keeps the form that is known; an instant is located without a form that could stand in for it
-    if policy.driven and policy.calibrated and chains.known is None and chains.recordings[0].window is None:
+    if (not late and policy.driven and policy.calibrated and chains.known is None
+            and chains.recordings[0].window is None):
         tried = here.with_forms(tried)
     if not findings.found:
         tried = here.from_plain(open_, tried)
     ranked = here.ranked(tried)
     # the parameters that the best hypothesis was led to may serve as well without it
     again = fit(chains.residuals(here.stage), started(here.known, ranked[0].fit.values),
-                least_ess=chains.policy.least_ess)
+                least_ess=chains.policy.least_ess, deadline=here.deadline)
     ess = largest_ess([here.current, again])
     if again.log_evidence(ess) > here.current.log_evidence(ess) + BETTER_ALONE:
         findings = replace(findings, final=again, base=findings.base if findings.found else again)

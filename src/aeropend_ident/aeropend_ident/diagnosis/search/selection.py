@@ -11,7 +11,6 @@ nominal model without its further terms), `ranked`.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -31,7 +30,7 @@ from aeropend_ident.diagnosis.search.hypotheses import (
     linear_parameters,
     other_forms,
 )
-from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess, screen
+from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess, passed, screen
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.signals import CHANNELS
 from aeropend_ident.signals.statistics import effective_sample_size
@@ -119,7 +118,7 @@ class SelectionRound:
     def budget_spent(self) -> bool:
         """Whether the search has cost as much time, or as many simulations, as it may."""
         if self.deadline is not None:
-            return time.monotonic() > self.deadline
+            return passed(self.deadline)
         budget = self.chains.policy.budget
         return budget is not None and self.chains.runs > budget
 
@@ -214,12 +213,11 @@ class SelectionRound:
         Of a rig with angle and command alone such terms may stand in for an effect; no step leads back from there.
         """
         plain, chains = self.chains.plain, self.chains
-        late = self.deadline is not None and self.budget_spent
-        if plain is None or late or any(mean_square(f, self.stage) < FORM_SHOWS for _, f in tried):
+        if plain is None or passed(self.deadline) or any(mean_square(f, self.stage) < FORM_SHOWS for _, f in tried):
             return tried
         there = type(chains)(plain, chains.recordings, chains.policy)
         known = nominal_parameters(there, self.stage)
-        base = fit(there.residuals(self.stage), known, least_ess=chains.policy.least_ess)
+        base = fit(there.residuals(self.stage), known, least_ess=chains.policy.least_ess, deadline=self.deadline)
         here = replace(self, chains=there, known=known, current=base)
         lead, best = min(here.converged(here.screened(candidates)), key=lambda item: item[1].mean_square)
         if best.mean_square > min(f.mean_square for _, f in tried):
@@ -335,11 +333,12 @@ class SelectionRound:
             begun = {**self.current.values, **dict(hypothesis.begun)}
         if begun is None and DEFINED[hypothesis.effect].linear_in:
             first = fit(lambda values: residuals(from_linear(hypothesis.effect, values)),
-                        [*known, *linear_parameters(hypothesis.effect)], rounds=3, least_ess=least)
+                        [*known, *linear_parameters(hypothesis.effect)], rounds=3, least_ess=least,
+                        deadline=self.deadline)
             begun = self._within_range(hypothesis.effect, from_linear(hypothesis.effect, first.values))
         if begun is not None:
-            return fit(residuals, started(adopted(known, hypothesis), begun), rounds, steps, least)
-        return fit(residuals, adopted(known, hypothesis, start), rounds, steps, least)
+            return fit(residuals, started(adopted(known, hypothesis), begun), rounds, steps, least, self.deadline)
+        return fit(residuals, adopted(known, hypothesis, start), rounds, steps, least, self.deadline)
 
     def _within_range(self, effect: str, own: dict[str, float]) -> dict[str, float]:
         """Values from a linear fit, with the second parameter within its range and the same product.
