@@ -105,7 +105,8 @@ def test_one_message_of_other_joints_takes_no_channel_away(bags, tmp_path):
     assert np.isfinite(named("one", ["臂", "转子"], ["arm", "rotor"]).theta).sum() == N - 1
     recording = named("all", ["pole", "fan"], ["pole", "fan"])
     assert "has no joint named arm or rotor (its joints: fan, pole): left out" in recording.notes[0]
-    assert "all_mended --theta JOINT:rad` takes it" in recording.notes[0]
+    assert "if pole is the arm, `import" in recording.notes[0]
+    assert "all_mended --theta pole:rad --omega fan.velocity:rad/s` takes it" in recording.notes[0]
 
 
 def test_commands_in_percent_are_said_where_they_are_the_duty(bags, tmp_path):

@@ -9,6 +9,8 @@ Example:
 from __future__ import annotations
 
 import dataclasses
+import math
+import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -51,7 +53,6 @@ _TOPICS = {
 }
 _ARM, _ROTOR = "arm", "rotor"
 _JOINTS = ("theta", "theta_dot", "omega")
-_TAKE = f"; if one is the arm, {mend('--theta JOINT:rad')} takes it"
 NO_JOINT = f"has no joint named {_ARM} or {_ROTOR}"
 """What a note says of joints that are none of ours."""
 
@@ -225,11 +226,13 @@ def _rigs(series: dict[tuple[str, str], _Series], bag: Bag, *, others: bool
         assert split is not None
         rigs.setdefault(split[0], {})[split[1]] = one
     strange: dict[str, str] = {}
+    takes: dict[str, str] = {}
     for place, topics in list(rigs.items()):
         joints = topics.get("joint_states")
         if joints is not None and (names := _other_joints(joints)) is not None:
-            its = f" (its joints: {', '.join(names)})" if names else ""
+            its = f" (its joints: {', '.join(names)})" if any(names) else ""
             strange[place] = f"{joints.topic} {NO_JOINT}{its}"
+            takes[place] = _taking(joints)
             if not others:
                 del topics["joint_states"]
         if not {"joint_states", "armature"} & set(topics):
@@ -239,9 +242,10 @@ def _rigs(series: dict[tuple[str, str], _Series], bag: Bag, *, others: bool
     if rigs and others:
         return rigs, {}
     if rigs:
-        return rigs, {place: f"{said}: left out{_TAKE}" for place, said in strange.items()}
+        return rigs, {place: f"{said}: left out{takes[place]}" for place, said in strange.items()}
     if strange:
-        raise RecordingError(f"{bag.path}: {'; '.join(strange.values())}{named(_TAKE, bag.path)}")
+        said = "; ".join(one + takes[place] for place, one in strange.items())
+        raise RecordingError(f"{bag.path}: {named(said, bag.path)}")
     if not bag.counts.total():
         why = f" ({bag.problems[0]})" if bag.problems else ""
         raise RecordingError(f"{bag.path}: holds no messages{why}")
@@ -257,6 +261,21 @@ def _other_joints(joints: _Series) -> list[str] | None:
         if {_ARM, _ROTOR} & names:
             return None
     return sorted(map(printable, names))[:MOST_NAMES] if decode(joints.messages[:1], _JOINT)[0] else None
+
+
+def _taking(joints: _Series) -> str:
+    """The command that takes joints of other names for ours: the first with an angle, and another with a speed."""
+    block, *_ = decode(joints.messages[:1], _JOINT)[0]
+    names = block.names.get("name", ())
+    turned = {field: [name for name, x in zip(names, np.ravel(block.numbers[field][:1]).tolist(), strict=False)
+                      if name and math.isfinite(x)] for field in ("position", "velocity")}
+    if not turned["position"]:
+        return ""
+    arm = turned["position"][0]
+    rotor = next((name for name in turned["velocity"] if name != arm), None)
+    options = [f"--theta {shlex.quote(f'{arm}:rad')}"]
+    options += [f"--omega {shlex.quote(f'{rotor}.velocity:rad/s')}"] if rotor is not None else []
+    return f"; if {printable(arm)} is the arm, {mend(*options)} takes it"
 
 
 def _choose(rigs: dict[str, dict[str, _Series]], namespace: str | None, bag: Bag) -> str:
@@ -426,7 +445,8 @@ class _Join:
             self.notes.append(f"{counted(timeless, 'message')} of {series.topic} {_has(timeless)} a stamp that is no "
                               "time (before 1970, or nanosec of 1e9 or more): left out")
         if understood.sum() > 1 and not stamps.any():
-            raise RecordingError(f"{series.topic}: header.stamp is never set, so its samples cannot be dated or joined")
+            raise RecordingError(f"{series.topic}: header.stamp is never set, so its samples cannot be dated or "
+                                 "joined: set it to the instant of each sample in the program that publishes them")
         rows = np.flatnonzero(understood)
         sorted_stamps, first = np.unique(stamps[rows], return_index=True)
         self.duplicates += len(rows) - len(first)

@@ -15,7 +15,7 @@ from aeropend_ident.checkup.check import Check, error, ok, warning
 from aeropend_ident.identification import dataset
 from aeropend_ident.identification.excitation_quality import quality
 from aeropend_ident.signals import mistakes
-from aeropend_ident.signals.from_bag import as_signals, likely_mistakes, no_angle
+from aeropend_ident.signals.from_bag import as_signals, check_stamps, likely_mistakes, no_angle
 from aeropend_ident.signals.mistakes import Mistake
 from aeropend_ident.signals.signals import MINIMUM_DURATION, STILL
 from aeropend_ident.signals.smoothing import lag
@@ -69,6 +69,11 @@ def checks(path: str, model: Model, namespace: str | None = None) -> Iterator[Ch
         yield (warning if LEFT_OUT in note else ok)(path, note)
     if not read.complete:
         yield warning(path, f"it was broken off or damaged: recover {path}")
+    try:
+        check_stamps(read)
+    except RecordingError as refused:  # without times nothing else can be judged
+        yield error(path, str(refused).removeprefix(f"{path}: "))
+        return
     likely = likely_mistakes(read, model) if read.duration >= MINIMUM_DURATION else []
     if likely:
         yield warning(path, named(mistakes.said(likely), path))
@@ -76,7 +81,7 @@ def checks(path: str, model: Model, namespace: str | None = None) -> Iterator[Ch
     if sure := [one for one in likely if one.sure]:
         until = " before this is mended" if any(one.options for one in sure) else ""
         yield warning(path, f"diagnose refuses it{until}")
-    else:
+    elif np.isfinite(read.theta).any():
         yield from _use(path, read, model)
 
 

@@ -331,7 +331,8 @@ def _late(readings: Mapping[str, Array], simulated: Mapping[str, Array], period:
         lead = best * every * period
         if lead >= least and left[best] < LATE_LEFT and left[best] < left[0] / LATE_BETTER:
             return Mistake(f"the {NAMES[name]} follows the duty best if that was {lead:.2f} s earlier, and no effect "
-                           "is ahead of its duty: is the duty stamped late?", sure=False)
+                           "is ahead of its duty: if the duty is stamped late, stamp it with the instant from which it acts, "
+                           "and record again", sure=False)
         return None
     return None
 
