@@ -128,6 +128,20 @@ def test_a_duty_that_is_inverted_is_refused_although_no_command_mends_it(columns
     assert "inverted (the rig follows 1 - duty)" in one.what
 
 
+def test_the_voltage_of_a_supply_is_refused(columns):
+    (one,) = mistakes.found(columns | {"v_a": 12.0 - 0.1 * columns["i_a"]}, columns["duty"], SAMPLE_PERIOD, BENCH)
+    assert one.sure
+    assert one.what.startswith("it looks as if the voltage is that of the supply")
+
+
+def test_joints_on_a_topic_of_another_name_are_said(columns, bags, tmp_path):
+    made = bags.content(len(columns["duty"]), columns=columns)
+    bag = bags.write(tmp_path / "bag", bags.Content(
+        [("/joints" if topic == "/joint_states" else topic, *rest) for topic, *rest in made.messages]))
+    with pytest.raises(RecordingError, match=r"there is no joint_states; /joints has another name: record it as joint_s"):
+        as_signals(read(bag), BENCH)
+
+
 def test_a_rotor_that_runs_up_under_the_duty_of_the_first_sample_is_no_mistake():
     duty = np.full(4000, 0.45)
     assert mistakes.found(rig.record(drawn_rig(31, {}), duty, 31)[0], duty, SAMPLE_PERIOD, BENCH) == []

@@ -132,4 +132,6 @@ def test_a_model_that_predicts_nothing_is_called_failed():
     assert "no verdict" in sentence.failed(made("cannot_tell"))
     off = replace(good, closure=replace(good.closure, gap_after=1.7))
     assert "--uncalibrated" in sentence.failed(off)
+    assert "--uncalibrated" in sentence.failed(made("none", closed=-0.2))
+    assert sentence.failed(made("none", closed=None)) == ""
     assert "--uncalibrated" not in sentence.failed(replace(off, identified=Identified("the angle", ())))

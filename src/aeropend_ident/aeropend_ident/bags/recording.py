@@ -55,6 +55,8 @@ _ARM, _ROTOR = "arm", "rotor"
 _JOINTS = ("theta", "theta_dot", "omega")
 NO_JOINT = f"has no joint named {_ARM} or {_ROTOR}"
 """What a note says of joints that are none of ours."""
+NO_JOINTS = "there is no joint_states"
+"""What a note says where joints have a topic of another name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +174,10 @@ def read(path: Path | str, namespace: str | None = None, *, judged: bool = True)
     rigs, strange = _rigs(series, bag, others=not judged)
     found = _choose(rigs, namespace, bag)
     notes = [strange[found]] if found in strange else []
+    odd = [topic for topic, msgtype in bag.counts if msgtype == _JOINT and split_topic(topic, msgtype) is None]
+    if odd and found not in strange and "joint_states" not in rigs[found]:
+        notes.append(f"{NO_JOINTS}; {printable(odd[0])} has another name: record it as joint_states (--ros-args -r "
+                     f"{printable(odd[0])}:=joint_states of the program that publishes it)")
     try:
         recording = _Join(rigs[found], notes, judged=judged).recording(str(path), found, complete=not bag.problems)
     except RecordingError as error:

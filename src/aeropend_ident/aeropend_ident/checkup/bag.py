@@ -45,8 +45,8 @@ Choice: 10 simulated and 13 real rigs have 0.7 to 0.99."""
 SHORT = 30.0
 """[s] Length below which a recording is called short (choice)."""
 
-LEFT_OUT = "left out"
-"""What a note says of data that is not used."""
+BAD = ("left out", "mends it")
+"""What a note says of data that is not used, or that may be wrong."""
 
 
 def checks(path: str, model: Model, namespace: str | None = None) -> Iterator[Check]:
@@ -66,7 +66,7 @@ def checks(path: str, model: Model, namespace: str | None = None) -> Iterator[Ch
     yield ok(path, f"{counted(len(read), 'sample')}, {read.duration:.1f} s{rate}, "
              f"with {', '.join(read.channels) or 'no channel'}")
     for note in read.notes:
-        yield (warning if LEFT_OUT in note else ok)(path, note)
+        yield (warning if any(words in note for words in BAD) else ok)(path, note)
     if not read.complete:
         yield warning(path, f"it was broken off or damaged: recover {path}")
     try:

@@ -151,7 +151,8 @@ def checked(read: Recording, model: Model, mounting: Mounting | None = None) -> 
 def no_angle(read: Recording) -> str:
     """Why a recording has no angle, and what to do if the arm has another name."""
     positions = [name for name in read.others if f"{name}.velocity" in read.others or not name.endswith(".velocity")]
-    if (said := next((note for note in read.notes if recording.NO_JOINT in note), None)) is not None:
+    if (said := next((note for note in read.notes if recording.NO_JOINT in note or recording.NO_JOINTS in note), None)
+        ) is not None:
         return f"no arm angle: {said}"
     if not positions:
         return "no arm angle was measured (joint_states, position of 'arm')"

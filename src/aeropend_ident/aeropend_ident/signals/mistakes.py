@@ -80,6 +80,9 @@ DRIVEN = 0.2
 RUN_UP = 3.0
 """[s] Time after the first sample in which a rotor may still run up or down (choice: that of a large rotor)."""
 
+STEADY = 0.2
+"""Range of the voltage of a supply, over its median (choice: no supply sags more; that of a motor begins at 0)."""
+
 STILL = 0.01
 """Width of the levels of the duty (choice)."""
 
@@ -214,6 +217,9 @@ def found(readings: Mapping[str, Array], duty: Array, period: float, model: Mode
                         sure=True, options=(f"--duty {name}:1", f"--{OPTIONS[name]} duty:{OWN[name]}"))]
     if (wrong := _turned_duty(readings, duty, period, model, simulated)) is not None:
         return [wrong]
+    if _of_the_supply(readings["v_a"], simulated["v_a"]):
+        return [Mistake("it looks as if the voltage is that of the supply, not that at the motor (it does not follow "
+                        "the duty): publish NaN as the voltage, or measure it behind the bridge", sure=True)]
     pairs = {}
     for name in OWN:
         x, y = simulated[name], readings[name]
@@ -277,6 +283,14 @@ def _turned_duty(readings: Mapping[str, Array], duty: Array, period: float, mode
     return None
 
 
+def _of_the_supply(y: Array, x: Array) -> bool:
+    """Whether a voltage (N,) stays near one value that is well above 0, where the simulated one (N,) varies."""
+    both = np.isfinite(x) & np.isfinite(y)
+    if both.sum() < LEAST or not (typical := float(np.median(y[both]))) > 0.0:
+        return False
+    return 0.0 < _span(y[both]) < STEADY * typical and _span(x[both]) > float(np.mean(x[both])) > 0.0
+
+
 def _largest_error(readings: Mapping[str, Array], simulated: Mapping[str, Array]) -> float:
     """The error of the channel that follows its simulation worst, of those that were measured."""
     return max((e for c in OWN if not math.isnan(e := _error(readings[c], simulated[c]))), default=math.nan)
@@ -331,8 +345,8 @@ def _late(readings: Mapping[str, Array], simulated: Mapping[str, Array], period:
         lead = best * every * period
         if lead >= least and left[best] < LATE_LEFT and left[best] < left[0] / LATE_BETTER:
             return Mistake(f"the {NAMES[name]} follows the duty best if that was {lead:.2f} s earlier, and no effect "
-                           "is ahead of its duty: if the duty is stamped late, stamp it with the instant from which it acts, "
-                           "and record again", sure=False)
+                           "is ahead of its duty: if the duty is stamped late, stamp it with the instant from which it "
+                           "acts, and record again", sure=False)
         return None
     return None
 

@@ -222,7 +222,8 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
         raise RecordingError(f"{name}: no arm angle was measured (joint_states, position of 'arm'); nothing to compare")
     if not np.isfinite(columns["duty"]).any():
         raise RecordingError(f"{name}: no duty was recorded (armature.percentage or duty_command); "
-                             "without it the model has no input")
+                             "without it the model has no input; record one of them too, or use --uncalibrated if the "
+                             "voltage was measured or the arm swings freely")
     duty, unsure = _between_samples(columns["duty"])
     shaken = np.zeros(n, dtype=bool)
     for gap in unsure:

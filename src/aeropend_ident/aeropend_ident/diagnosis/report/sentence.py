@@ -62,9 +62,13 @@ def failed(document: DiagnosisDocument) -> str:
     """Why the models of a diagnosis are of no use, as a sentence; "" if they are."""
     if document.which.verdict == CANNOT_TELL:
         return "This diagnosis has no verdict. Use neither its numbers nor its augmented model."
+    advice = ("" if document.identified else " Check the model file, and the unit, sign and zero of the angle; if "
+              "the parameters of the rig are not known, use --uncalibrated.")
+    budget = document.closure.budget
+    if (advice and document.which.verdict == "none" and closing(document.closure) == "none"
+            and not (budget is not None and budget.not_repeatable > MOST)):
+        return f"No effect of the catalogue brings the model closer to the rig.{advice}"
     if document.closure.gap_after >= WORTHLESS:
-        advice = ("" if document.identified else " Check the model file, and the unit, sign and zero of the angle; if "
-                  "the parameters of the rig are not known, use --uncalibrated.")
         return ("The augmented model is off by as much as the readings vary, or by more: it predicts no more than "
                 f"constant readings do.{advice}")
     return ""
