@@ -234,7 +234,7 @@ def _searched(model: Model, recordings: Sequence[Signals], keep: Collection[str]
     tests = [WeakForm(s) for s in coarse]
     kinds = (False, True) if "coulomb_friction" not in keep else (False,)
     starts = [likeliest(model, coarse, tests, friction=friction) for friction in kinds]
-    begun = []
+    begun: list[Model] = []
     for found in starts:
         best = {s.lag: s.model for s in reversed(found)}
         if best and not (begun and passed(deadline)):
