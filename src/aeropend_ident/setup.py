@@ -9,10 +9,12 @@ setup(
     name=PACKAGE,
     version="0.1.0",
     packages=find_packages(exclude=["test", "test.*"]),
-    package_data={"aeropend_ident": ["diagnosis/report/templates/*.j2", "py.typed"]},
+    package_data={"aeropend_ident": ["diagnosis/report/templates/*.j2", "launch/*.yaml", "py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
+        (f"share/{PACKAGE}/launch",
+         [f"{PACKAGE}/launch/{name}.launch.yaml" for name in ("experiment", "hardware", "sim")]),
     ],
     install_requires=["Jinja2", "joblib", "lz4", "numba", "numpy", "openpyxl", "pysindy", "PyYAML", "rich", "rosbags",
                       "scipy", "threadpoolctl"],
