@@ -3,9 +3,11 @@
 
 import ctypes
 import hashlib
+import re
 import subprocess
 import sys
 import types
+import xml.etree.ElementTree as ET
 import zipfile
 
 import numpy as np
@@ -184,6 +186,31 @@ def test_a_start_angle_is_that_of_a_rig_let_go():
     free = dynamics.simulate(BENCH, np.zeros(200), state=dynamics.State(theta=0.5))
     assert np.allclose(out[:, 0], free.theta, atol=1e-12)
     assert out[0, 6] == 0.5
+
+
+@pytest.mark.promise("Other simulators", "No text of a model file becomes code of an exported file")
+def test_no_text_of_a_model_file_becomes_code(tmp_path):
+    bad = '"""\\n*/ int y; /* -->'
+    definition = {"place": "arm", "physics": bad, "term": "-k * pow", "parameters": {
+        "k": {"unit": "1/s^2", "default": 2, "low": 0, "high": 9}},
+        "memory": {"name": "pow", "unit": "rad", "rate": "(theta - pow) / (1e-2 * sqrt(s * s))"}}
+    definition["parameters"]["s"] = {"unit": "s", "default": 5, "low": 1, "high": 9}
+    effect_file.define({"evil": definition}, "test")
+    try:
+        model = with_effects("evil")
+        model = Model(bad, model.model, model.sensing, model.effects)
+        ours = Ours(model, DUTY)
+        rig = module(targets.python_module(model)).Model()
+        assert ours.misfit(np.array([rig.step(float(duty)) for duty in DUTY]).T) < 1e-9
+        for name, text in targets.c_files(model).items():
+            (tmp_path / name).write_text(text)
+        line = ["gcc", "-std=c99", "-Wall", "-Werror", "-fsyntax-only", "aeropend_model.c"]
+        assert subprocess.run(line, cwd=tmp_path, check=False).returncode == 0
+        assert "int y" not in re.sub(r"/\*.*?\*/", "", (tmp_path / "aeropend_model.c").read_text(), flags=re.DOTALL)
+        for text in (rigid_body.mjcf(model), rigid_body.urdf(model), rigid_body.sdf(model)):
+            ET.fromstring(text)
+    finally:
+        effect_file.forget("evil")
 
 
 def test_what_a_target_cannot_hold_is_said_in_its_files_and_on_the_screen(tmp_path, capsys):

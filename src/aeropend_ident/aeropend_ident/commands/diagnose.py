@@ -40,6 +40,9 @@ from aeropend_sim.model import effect_file
 from aeropend_sim.model.parameters import PRESETS, load
 from aeropend_sim.untrusted import printable
 
+BROKEN = 1
+"""Exit code if the verdict breaks a rule of `--fail-on` (convention: 1 is the answer no)."""
+
 EXAMPLES = """examples:
   diagnose my_bag                                compare a recording with the preset 'bench'
   diagnose monday tuesday --model rig.yaml       several recordings of one rig, fitted together
@@ -311,7 +314,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         checks.write_junit(junit, said)
     if rules:
         print(checks.summary(said))
-    return checks.BROKEN if any(one.broken for one in said) else 0
+    return BROKEN if any(one.broken for one in said) else 0
 
 
 if __name__ == "__main__":

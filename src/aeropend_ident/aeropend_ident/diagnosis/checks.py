@@ -17,9 +17,6 @@ from aeropend_sim.errors import UserError
 from aeropend_sim.model.effects import DEFINED, PARAMETER_MISMATCH
 from aeropend_sim.untrusted import printable
 
-BROKEN = 1
-"""Exit code if a rule is broken (convention of programs that check)."""
-
 NUMBERS = {"gap": "gap of the nominal model on held-out data, over the spread of the signals",
            "gap_after": "the same of the augmented model", "closed": "share of the gap that closes",
            "share": "share of the squared gap of any effect that is claimed"}

@@ -16,6 +16,7 @@ from aeropend_sim.model import terms as model_terms
 from aeropend_sim.model.effects import Effect
 from aeropend_sim.model.formula import CONSTANTS, FUNCTIONS, QUANTITIES, parse
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+from aeropend_sim.untrusted import one_line
 
 TERM, RATE, SLOT = range(3)
 """Columns of `Terms.calls`."""
@@ -24,6 +25,10 @@ TERM, RATE, SLOT = range(3)
 def _library_sine_cosine(x: float) -> tuple[float, float]:
     """(sin x, cos x)."""
     return math.sin(x), math.cos(x)
+
+
+MEMORY = "_memory"
+"""Name of the memory of an effect in its formulas; no effect file can define it."""
 
 
 class _Formulas:
@@ -56,14 +61,14 @@ class _Formulas:
         values = {name: Known(getattr(q.value, name)) if isinstance(q, Known) else field_of(q, name)
                   for name in QUANTITIES}
         if effect.memory:
-            values[effect.memory] = memory
+            values[MEMORY] = memory
         arguments: dict[str, Type] = dict.fromkeys(values, float)
         known = {**CONSTANTS, **called.numbers, **{name: f.call for name, f in FUNCTIONS.items()}}
         text, name, doc = effect.term, f"term_{effect.id}", effect.physics
         if called.rate:
             text, name, doc = effect.rate, f"rate_{effect.id}", f"d{effect.memory}/dt of {effect.id}"
-        tree = _Floats().visit(parse(text, [*arguments, *called.numbers]).expression)
-        return program.call(program.formula(name, tree, arguments, known, doc), values)
+        tree = _Coded(effect.memory).visit(parse(text, [*QUANTITIES, effect.memory, *called.numbers]).expression)
+        return program.call(program.formula(name, tree, arguments, known, in_comment(doc)), values)
 
 
 @dataclass(frozen=True)
@@ -75,11 +80,26 @@ class _Called:
     rate: bool
 
 
-class _Floats(ast.NodeTransformer):
-    """Whole numbers of a formula are floats, as in `formula.compiled`."""
+class _Coded(ast.NodeTransformer):
+    """Whole numbers of a formula are floats, as in `formula.compiled`; the memory gets a name that nothing else has."""
+
+    def __init__(self, memory: str) -> None:
+        self.memory = memory
 
     def visit_Constant(self, node: ast.Constant) -> ast.expr:
         return ast.Constant(float(node.value))  # type: ignore[arg-type]
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        return ast.Name(MEMORY, ast.Load()) if node.id == self.memory else node
+
+
+def in_comment(text: str) -> str:
+    """A text of unknown origin for a comment of C or a docstring of Python, which it cannot end.
+
+    Args:
+        text: of a model file.
+    """
+    return one_line(text).replace("\\", "/").replace("*/", "* /").replace("/*", "/ *").replace('"', "'")
 
 
 def build(model: Model, period: float = SAMPLE_PERIOD, *, library_sine: bool = False,

@@ -10,12 +10,11 @@ from typing import Any
 
 from aeropend_sim.export import c_source, python_source
 from aeropend_sim.export.plant_step import FUNCTIONS, Outputs
-from aeropend_sim.export.program import build
+from aeropend_sim.export.program import build, in_comment
 from aeropend_sim.export.specialise import fields
 from aeropend_sim.model import actuator
 from aeropend_sim.model.effects import DEFINED, PARAMETER_MISMATCH
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
-from aeropend_sim.untrusted import printable
 
 MODULE = "aeropend_model"
 """Name of the files of each target."""
@@ -72,11 +71,11 @@ def causal(model: Model) -> Model:
 
 def described(model: Model) -> list[str]:
     """Lines that say what a file was made from."""
-    lines = [f"The aeropendulum's model {printable(model.name)}, written by aeropend's command export."]
+    lines = [f"The aeropendulum's model {in_comment(model.name)}, written by aeropend's command export."]
     for id_, parameters in model.effects.items():
         numbers = ", ".join(f"{name} = {value:g}" for name, value in parameters.items())
         what = "" if id_ == PARAMETER_MISMATCH else f": {DEFINED[id_].physics}"
-        lines.append(f"effect {id_} ({printable(numbers)}){printable(what)}")
+        lines.append(in_comment(f"effect {id_} ({numbers}){what}"))
     return [*lines, *(f"not in it: {each}" for each in missing(model))]
 
 
