@@ -18,7 +18,7 @@ setup(
         (f"share/{PACKAGE}/layouts", ["aeropend_sim/layouts/foxglove.json", "aeropend_sim/layouts/plotjuggler.xml"]),
     ],
     install_requires=["argcomplete", "numba", "numpy", "PyYAML", "rich", "scipy"],
-    extras_require={"mujoco": ["mujoco"], "test": ["hypothesis", "pytest", "pytest-timeout"]},
+    extras_require={"mujoco": ["mujoco"], "test": ["FMPy", "hypothesis", "mujoco", "pytest", "pytest-timeout"]},
     python_requires=">=3.10",
     zip_safe=False,
     maintainer="aeropend maintainers",

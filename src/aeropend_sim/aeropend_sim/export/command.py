@@ -16,9 +16,9 @@ from aeropend_sim.untrusted import printable
 TARGETS = ("python", "c", "fmu", "mjcf", "urdf", "sdf")
 
 EXAMPLES = f"""examples:
-  aeropend export verdict/augmented.yaml --to mjcf --out in_mujoco
-  aeropend export verdict/augmented.yaml --to fmu --out in_simulink
-  aeropend export bench --to c --out src --period 0.001
+  export verdict/augmented.yaml --to mjcf --out in_mujoco
+  export verdict/augmented.yaml --to fmu --out in_simulink
+  export bench --to c --out src --period 0.001
   export rig.yaml --to urdf --out description
 
   mjcf    aeropendulum.xml for MuJoCo, and aeropend_mujoco.py, which drives it with motor, propeller and effects
