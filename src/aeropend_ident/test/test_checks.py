@@ -77,4 +77,6 @@ def test_the_last_line_says_which_rules_are_broken():
     rules = [checks.parse(text) for text in ("gap>5%", "unknown", "gust>5%")]
     said = checks.check(FOUND, rules)
     assert checks.summary(said) == "check: failed, 2 of 3 rules broken: gap>5% (it is 20 %); gust>5% (it is 10 %)"
+    lost = checks.Outcome("other", "unknown", error="gone")
+    assert checks.summary([said[1], lost]) == "check: failed, 0 of 1 rules broken; 1 without a verdict"
     assert checks.summary(said[1:2]) == "check: passed, 1 of 1 rules kept"

@@ -314,7 +314,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         checks.write_junit(junit, said)
     if rules:
         print(checks.summary(said))
-    return BROKEN if any(one.broken for one in said) else 0
+    return BROKEN if any(one.broken or one.error for one in said) else 0
 
 
 if __name__ == "__main__":

@@ -148,9 +148,10 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     told = [f"{one.recording}: " * several + f"{one.rule} ({one.found})" for one in broken]
     left = f"; {failed} without a verdict" if failed else ""
     checked = [one for one in outcomes if not one.error]
-    if not broken:
-        return printable(f"check: passed, {len(checked)} of {len(checked)} rules kept{left}")
-    return printable(f"check: failed, {len(broken)} of {len(checked)} rules broken: {'; '.join(told)}{left}")
+    if not broken and not failed:
+        return f"check: passed, {len(checked)} of {len(checked)} rules kept"
+    what = ": " * bool(told) + "; ".join(told)
+    return printable(f"check: failed, {len(broken)} of {len(checked)} rules broken{what}{left}")
 
 
 def write_junit(path: Path, outcomes: Sequence[Outcome]) -> None:
