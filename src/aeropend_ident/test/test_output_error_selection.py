@@ -7,6 +7,7 @@ from sparse_data import TERMS, pushed_once
 from aeropend_ident.commands.identify import document, lines
 from aeropend_ident.identification.dataset import from_arrays
 from aeropend_ident.identification.identify import identify
+from aeropend_ident.identification.output_error import ReducedNormalEquations
 from aeropend_ident.identification.output_error_selection import QuadraticMisfit
 
 
@@ -52,3 +53,11 @@ def test_a_term_that_the_data_cannot_tell_from_another_is_said_to_be_undetermine
     assert frozenset(("x", "sin(x)")) in pairs
     listed = document(found, data, "bag", "bench", 0.0)["undetermined"]
     assert frozenset(("x", "sin(x)")) in {frozenset((one["term"], one.get("or"))) for one in listed}
+
+
+@pytest.mark.filterwarnings("error")
+def test_terms_that_are_equal_but_for_rounding_cost_no_infinite_misfit():
+    H = np.array([[1.0, 1.0 + 1e-9], [1.0 + 1e-9, 1.0]])  # not positive definite, by rounding
+    normal = ReducedNormalEquations(H, np.array([1.0, 0.0]), 1.0, 10, [])
+    changes = list(QuadraticMisfit(normal, np.zeros(2), 1.0, np.zeros(2, int)).single_changes([0, 1]))
+    assert all(np.isfinite(change.value) for change in changes)

@@ -64,6 +64,11 @@ SAME = 10.0
 """Increase of the criterion up to which an exchanged term explains the data as well. Choice; a greater difference in
 BIC is called very strong evidence (Kass & Raftery, Journal of the American Statistical Association 90, 1995)."""
 
+LEAST_OF_INVERSE = 0.5
+"""What each element of the diagonal of an inverse has at least.
+
+Derived: where the diagonal of a positive definite matrix is 1, that of its inverse is 1 or more, but for rounding."""
+
 RIDGE = 1e-11
 """Added to the diagonal of scaled systems, so that equal terms do not make them singular. Choice."""
 
@@ -136,7 +141,7 @@ class QuadraticMisfit:
         yield from self._addition(s, inverse, step, base)
         if s:
             total = self.c[s] + step
-            loss = total**2 / np.maximum(np.diag(inverse), 1e-300)
+            loss = total**2 / np.maximum(np.diag(inverse), LEAST_OF_INVERSE)
             j = int(np.argmin(loss))
             yield Change(base + float(loss[j]) - self.penalty, tuple(s[:j] + s[j + 1:]))
 
