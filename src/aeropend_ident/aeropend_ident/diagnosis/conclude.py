@@ -27,6 +27,7 @@ from aeropend_ident.diagnosis.joint_fit import WIDER, JointFit
 from aeropend_ident.diagnosis.policy import CALIBRATED, MATERIAL_SHARE, angle_only
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis
 from aeropend_ident.diagnosis.search.onset import Onset
+from aeropend_ident.diagnosis.search.search import refit
 from aeropend_ident.diagnosis.search.selection import FORM_SHOWS, mean_square, plausible, squared_gap
 from aeropend_ident.diagnosis.strength import Strengths
 from aeropend_ident.estimation.map_fit import Fit
@@ -228,21 +229,29 @@ def not_separable(chains: CutChains, findings: Mapping[str, Findings]
                 continue
             first, found = selection[0], selection in f.found
             pairs += [(first, r) for r in selection[1:] if r.probability > chains.policy.undecided
-                      or (found and _closes_as_much(chains, stage, before, first, r))]
+                      or (found and _closes_as_much(chains, stage, f, before, first, r))]
             before = first.fit
     return pairs
 
 
-def _closes_as_much(chains: CutChains, stage: str, before: Fit, first: RankedHypothesis, rival: RankedHypothesis
-                    ) -> bool:
+def _closes_as_much(chains: CutChains, stage: str, findings: Findings, before: Fit, first: RankedHypothesis,
+                    rival: RankedHypothesis) -> bool:
     """Whether a rival closes as much of the gap as the first, while neither explains all.
 
     What both leave may then decide between them, if it is more than that by which they differ. A parameter that is off
-    only stands in for an effect.
+    only stands in for an effect. Of several effects of a stage, each rival is fitted beside the others.
     """
     if rival.hypothesis.parameter or mean_square(first.fit, stage) < FORM_SHOWS:
         return False
-    open_, best, left = (squared_gap(chains, f, CHANNELS_OF[stage]) for f in (before, first.fit, rival.fit))
+    fits = (before, first.fit, rival.fit)
+    if len(findings.effects) > 1:
+        beside = [h for h in findings.effects if h is not first.hypothesis]
+        if rival.gain <= 0.0 or rival.hypothesis.family in {h.family for h in beside}:
+            return False
+        values = {**findings.final.values, **{p.name: rival.fit.values[p.name] for p in rival.hypothesis.own}}
+        fits = (refit(chains, stage, beside, findings.final.values), findings.final,
+                refit(chains, stage, [*beside, rival.hypothesis], values))
+    open_, best, left = (squared_gap(chains, f, CHANNELS_OF[stage]) for f in fits)
     return left - best < min(MATERIAL_SHARE * (open_ - best), best)
 
 

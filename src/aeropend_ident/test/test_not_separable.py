@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which pairs of effects the verdict calls not separable."""
+
+from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.conclude import not_separable
+from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis
+from aeropend_ident.diagnosis.search.hypotheses import hypotheses
+from aeropend_ident.diagnosis.search.search import refit, unsearched
+from aeropend_ident.testing.rigs import BENCH, recorded
+
+
+def test_a_rival_is_compared_beside_the_other_effects_of_its_stage():
+    """A cable stays unexplained: what the lags differ by is less than what it leaves."""
+    made = recorded(3, {"thrust_lag": {"tau": 0.05}, "coulomb_friction": {"accel": 0.15},
+                        "cable_torque": {"k": 0.3, "theta0": 0.3}}, 20.0)
+    chains = CutChains(BENCH, [made])
+    base = unsearched(chains)["arm"].base
+    of = {h.effect: h for h in hypotheses(BENCH)}
+    lag, late, friction, flex = (of[e] for e in ("thrust_lag", "encoder_lag", "coulomb_friction", "mast_flex"))
+    final = refit(chains, "arm", [lag, friction], base.values)
+
+    def ranked(h, fit, gain, probability):
+        return RankedHypothesis(h, fit, gain, probability)
+
+    alone = [ranked(h, refit(chains, "arm", [h], base.values), gain, 0.0) for h, gain in ((late, 480.0), (flex, 60.0))]
+    found = ((ranked(lag, final, 500.0, 1.0), *alone), (ranked(friction, final, 50.0, 1.0),))
+    pairs = not_separable(chains, {"arm": Findings("arm", base, final, found)})
+    assert [(first.hypothesis.effect, rival.hypothesis.effect) for first, rival in pairs] == [
+        ("thrust_lag", "encoder_lag")]
