@@ -228,13 +228,11 @@ def test_what_a_target_cannot_hold_is_said_in_its_files_and_on_the_screen(tmp_pa
     assert "cable_torque" not in "".join(map(str, rigid_body.missing(model, "sdf")))
 
 
-def test_files_are_not_overwritten_unasked(tmp_path):
-    line = [sys.executable, "-m", "aeropend_sim.export.command", "bench", "--to", "urdf", "--out", str(tmp_path)]
-    runs = [subprocess.run([*line, *more], capture_output=True, text=True, check=False)
-            for more in ([], [], ["--overwrite"])]
-    assert [run.returncode for run in runs] == [0, 2, 0]
-    assert runs[1].stderr == (f"export: {tmp_path / 'aeropendulum.urdf'} exists: name another folder with --out, "
-                              "or give --overwrite\n")
+def test_files_are_not_overwritten_unasked(tmp_path, capsys):
+    line = ["bench", "--to", "urdf", "--out", str(tmp_path)]
+    assert [command.main([*line, *more]) for more in ([], [], ["--overwrite"])] == [0, 2, 0]
+    assert capsys.readouterr().err == (f"export: {tmp_path / 'aeropendulum.urdf'} exists: name another folder with "
+                                       "--out, or give --overwrite\n")
 
 
 def test_without_a_compiler_the_fmu_has_its_sources(tmp_path, monkeypatch):

@@ -110,7 +110,7 @@ def missing(model: Model, kind: str) -> list[Missing]:
         model: parameters and effects.
         kind: `mjcf`, `urdf` or `sdf`.
     """
-    found = [Missing(id_, f"{DEFINED[id_].place}: {DEFINED[id_].physics}") for id_ in model.effects
+    found = [Missing(id_, ", ".join(filter(None, (DEFINED[id_].place, DEFINED[id_].physics)))) for id_ in model.effects
              if id_ != PARAMETER_MISMATCH and id_ not in HELD[kind]]
     if kind == "urdf":
         found.append(Missing("gravity", "a URDF has none: the simulator must set 9.81 m/s²"))

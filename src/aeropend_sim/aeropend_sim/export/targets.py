@@ -74,7 +74,8 @@ def described(model: Model) -> list[str]:
     lines = [f"The aeropendulum's model {in_comment(model.name)}, written by aeropend's command export."]
     for id_, parameters in model.effects.items():
         numbers = ", ".join(f"{name} = {value:g}" for name, value in parameters.items())
-        what = "" if id_ == PARAMETER_MISMATCH else f": {DEFINED[id_].physics}"
+        physics = "" if id_ == PARAMETER_MISMATCH else DEFINED[id_].physics
+        what = f": {physics}" if physics else ""
         lines.append(in_comment(f"effect {id_} ({numbers}){what}"))
     return [*lines, *(f"not in it: {each}" for each in missing(model))]
 
