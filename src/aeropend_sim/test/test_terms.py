@@ -153,3 +153,5 @@ def test_too_many_memories_are_refused():
     effect_file.define({f"hose_{k}": hose for k in range(5)}, "test_terms")
     with pytest.raises(UserError, match="5 effects by formula with a memory"):
         terms(with_(*(f"hose_{k}" for k in range(5))).effects)
+    four = [f"hose_{k}" for k in range(4)]
+    assert simulate(with_(*four, "as_drag"), DUTY).theta[-1] != simulate(with_(*four), DUTY).theta[-1]

@@ -119,7 +119,7 @@ def in_order(effects: Mapping[str, Mapping[str, float]], places: Sequence[str] =
     memories = [bool(e.memory) for e, _ in active]
     if sum(memories) > SLOTS:
         raise UserError(f"{sum(memories)} effects by formula with a memory; {SLOTS} are possible in one model")
-    return [(e, {name: p.get(name, q.neutral) for name, q in e.parameters.items()}, min(sum(memories[:k]), SLOTS))
+    return [(e, {name: p.get(name, q.neutral) for name, q in e.parameters.items()}, min(sum(memories[:k]), SLOTS - 1))
             for k, (e, p) in enumerate(active)]
 
 
