@@ -289,8 +289,7 @@ def test_a_search_ends_at_its_time_and_says_so():
     none, long = (diagnose(BENCH, [signals], 2, seconds=s) for s in (0.0, 600.0))
     assert none.conclusions.which.effects == ()
     assert none.conclusions.which.verdict == "cannot_tell"
-    assert ("the time was up before any effect of the motor and of the arm was tried"
-            in none.conclusions.which.unexplained[0])
+    assert "any effect of the motor and of the arm was tried" in none.conclusions.which.unexplained[0]
     assert any("--seconds" in note for s in none.signals for note in s.notes)
     assert set(long.conclusions.which.effects) == {"coulomb_friction", "brush_drop"}
     assert not any("--seconds" in note for s in long.signals for note in s.notes)

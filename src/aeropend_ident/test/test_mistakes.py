@@ -132,13 +132,15 @@ def test_the_voltage_of_a_supply_is_refused(columns):
     (one,) = mistakes.found(columns | {"v_a": 12.0 - 0.1 * columns["i_a"]}, columns["duty"], SAMPLE_PERIOD, BENCH)
     assert one.sure
     assert one.what.startswith("it looks as if the voltage is that of the supply")
+    steady = {**rig.record(drawn_rig(31, {}), np.full(4000, 0.45), 31)[0]}
+    assert mistakes.found(steady, np.linspace(4e-7, 5e-7, 4000), SAMPLE_PERIOD, BENCH) == []
 
 
 def test_joints_on_a_topic_of_another_name_are_said(columns, bags, tmp_path):
     made = bags.content(len(columns["duty"]), columns=columns)
     bag = bags.write(tmp_path / "bag", bags.Content(
         [("/joints" if topic == "/joint_states" else topic, *rest) for topic, *rest in made.messages]))
-    with pytest.raises(RecordingError, match=r"there is no joint_states; /joints has another name: record it as"):
+    with pytest.raises(RecordingError, match=r"there is no joint_states; /joints has another name: record it"):
         as_signals(read(bag), BENCH)
 
 

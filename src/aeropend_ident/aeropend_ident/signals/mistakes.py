@@ -217,7 +217,7 @@ def found(readings: Mapping[str, Array], duty: Array, period: float, model: Mode
                         sure=True, options=(f"--duty {name}:1", f"--{OPTIONS[name]} duty:{OWN[name]}"))]
     if (wrong := _turned_duty(readings, duty, period, model, simulated)) is not None:
         return [wrong]
-    if _of_the_supply(readings["v_a"], simulated["v_a"]):
+    if _of_the_supply(readings["v_a"], simulated["v_a"], float(voltage(model.model, 1.0))):
         return [Mistake("it looks as if the voltage is that of the supply, not that at the motor (it does not follow "
                         "the duty): publish NaN as the voltage, or measure it behind the bridge", sure=True)]
     pairs = {}
@@ -283,12 +283,18 @@ def _turned_duty(readings: Mapping[str, Array], duty: Array, period: float, mode
     return None
 
 
-def _of_the_supply(y: Array, x: Array) -> bool:
-    """Whether a voltage (N,) stays near one value that is well above 0, where the simulated one (N,) varies."""
+def _of_the_supply(y: Array, x: Array, full: float) -> bool:
+    """Whether a voltage (N,) stays near one value that is well above 0, where the simulated one (N,) varies.
+
+    Args:
+        y: [V] as read.
+        x: [V] simulated.
+        full: [V] of full duty.
+    """
     both = np.isfinite(x) & np.isfinite(y)
     if both.sum() < LEAST or not (typical := float(np.median(y[both]))) > 0.0:
         return False
-    return 0.0 < _span(y[both]) < STEADY * typical and _span(x[both]) > float(np.mean(x[both])) > 0.0
+    return 0.0 < _span(y[both]) < STEADY * typical and _span(x[both]) > DRIVEN * full
 
 
 def _largest_error(readings: Mapping[str, Array], simulated: Mapping[str, Array]) -> float:
