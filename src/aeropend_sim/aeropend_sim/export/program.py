@@ -48,7 +48,7 @@ class _Formulas:
         table, row, column = (g.value for g in given)  # type: ignore[union-attr]
         effect, numbers, slot = self._rows[table][row]
         if column == SLOT:
-            return Known(min(slot, model_terms.SLOTS - 1))
+            return Known(slot)
         if column == RATE and not effect.memory:
             return Known(0)
         return Known(_Called(effect, numbers, rate=column == RATE))
