@@ -38,6 +38,7 @@ setup(
             "excitation_quality = aeropend_ident.commands.excitation_quality:main",
             "step_response = aeropend_ident.commands.step_response:main",
             "doctor = aeropend_ident.commands.doctor:main",
+            "watch = aeropend_ident.nodes.watch:main",
             "demo = aeropend_ident.commands.demo:main",
             "precompile = aeropend_ident.commands.precompile:main",
         ]

@@ -27,6 +27,7 @@ LAYERS = [
     ["diagnosis.results", "diagnosis.checks"],
     ["diagnosis.batch", "diagnosis.dask_cluster"],
     ["tables", "bench_tests", "checkup"],
+    ["live"],
     ["public", "testing"],
     ["nodes", "commands"],
     ["studies"],

@@ -94,6 +94,16 @@ def float64(value: float) -> bytes:
     return bytes(out)
 
 
+def read_float64(message: bytes) -> float:
+    """Read a serialized `std_msgs/msg/Float64`.
+
+    Raises:
+        MALFORMED: it ends early, or is not plain CDR.
+    """
+    (value,) = struct.unpack_from(f"{_order(message)}d", message, 4)
+    return float(value)
+
+
 def _time(seconds: int, nanoseconds: int) -> int:
     """[ns] A stamp."""
     if not is_time(seconds, nanoseconds):

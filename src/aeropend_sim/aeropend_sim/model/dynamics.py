@@ -963,7 +963,7 @@ def term_rates(n: Mapping[str, float], top_speed: float, added: Terms) -> tuple[
     return arm + lever * thrust, math.sqrt(arm_angle + lever * thrust_angle), rotor / n["J_m"]
 
 
-def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0
+def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0, *, full: bool = False
             ) -> tuple[Coefficients, Values | None, Extra | None, Terms | None]:
     """Coefficients of a model for `run`, `run_arm` and `run_motor`.
 
@@ -971,12 +971,15 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0
         model: parameters and effects.
         period: [s] length of a hold.
         steps: steps of a hold; 0: `steps_in` decides.
+        full: with the coefficients of the effects, also where there are none.
 
     Returns:
         The coefficients, the effects, the coefficients of the effects, and their terms by formula. What the model does
         not need is None.
     """
     n, e, added = _parts(model)
+    if full and e is None:
+        e = NO_EFFECT
     return _prepared(n, e, added, period, steps or _steps_in(period, *_rates(n, e, added, period)))
 
 

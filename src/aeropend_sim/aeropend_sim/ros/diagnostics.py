@@ -32,14 +32,20 @@ class Diagnostics:
         node: the node.
         report: returns the present warning ("" for none) and the counters.
         hardware_id: the device that the node stands for.
+        further: returns statuses that are published with the node's own.
     """
 
     def __init__(
-        self, node: Node, report: Callable[[], tuple[str, Mapping[str, object]]], hardware_id: str = ""
+        self,
+        node: Node,
+        report: Callable[[], tuple[str, Mapping[str, object]]],
+        hardware_id: str = "",
+        further: Callable[[], list[DiagnosticStatus]] = list,
     ) -> None:
         self._node = node
         self._report = report
         self._hardware_id = hardware_id
+        self._further = further
         self._publisher = node.create_publisher(DiagnosticArray, interface.DIAGNOSTICS, interface.QOS)
         # wall time: a node must report even when its /clock has stopped
         self._timer = node.create_timer(1.0, self.publish, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -54,7 +60,7 @@ class Diagnostics:
             hardware_id=self._hardware_id,
             values=[KeyValue(key=key, value=_text(value)) for key, value in values.items()],
         )
-        message = DiagnosticArray(status=[status])
+        message = DiagnosticArray(status=[status, *self._further()])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
 

@@ -1,0 +1,406 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The model beside the rig: each stage of the cut chain fed with what was measured, and the whole chain from the duty.
+
+As in the diagnosis (docs/method.md, step 3), but causal, and for a few samples at a time. The motor is driven by the
+voltage read. The arm is driven by the speed of the model plus the error of the last pulses, and follows the angle read
+through an observer, so that it forgets what is past. What the observer has not expected, the innovation, is the residual
+of the arm. Each column of the bank (`bank`) has a model of its own beside the nominal one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba.typed import List
+from numpy.typing import NDArray
+
+from aeropend_ident.diagnosis.chain.priors import REFERENCE_GRAVITY
+from aeropend_ident.live.bank import Column
+from aeropend_sim.compiled import njit
+from aeropend_sim.model import actuator, dynamics, sensing
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+
+Array = NDArray[np.float64]
+
+OBSERVER_RATE = 8.0
+"""[rad/s] Natural frequency of the observer of the arm, in those of an arm with `REFERENCE_GRAVITY`.
+
+Choice: it forgets within about a fifth of a second, and passes three quarters of a constant torque that an open loop
+would show."""
+
+OBSERVER_DAMPING = 0.7
+"""Damping ratio of the observer (convention: fastest without overshoot that matters)."""
+
+TURNS = 256
+"""Samples of the rotor's angle that are remembered (derived: the longest pulse interval, `sensing.SPEED_TIMEOUT`)."""
+
+SLACK = 0.6
+"""Sample periods by which the instant of a pulse may miss the sample that shows it (choice: rounding of the tick)."""
+
+CHANNELS = ("v_a", "i_a", "omega", "theta")
+"""Channels, in the order of the chain."""
+
+
+class Samples(NamedTuple):
+    """Some consecutive samples, (N,) each, SI units; what was not read is NaN."""
+
+    theta: Array
+    omega: Array
+    i_a: Array
+    v_a: Array
+    duty: Array
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """What the stages leave of some samples.
+
+    Attributes:
+        rows: stage -> (rows, 1 + M): measured minus model, first of the nominal model, then of each column of the
+            stage, in noises of a reading (floors).
+        channel: stage -> (rows,) number of the channel of each row, as in `CHANNELS`.
+        at: stage -> (rows,) sample of each row.
+        spikes: speeds whose pulse interval does not fit the time that passed.
+        pulses: number of pulses.
+        said: readings of the free-running model (5, N), in the order of `Samples`.
+    """
+
+    rows: dict[str, Array]
+    channel: dict[str, NDArray[np.int64]]
+    at: dict[str, NDArray[np.int64]]
+    spikes: int
+    pulses: int
+    said: Samples
+
+
+def noise(model: Model) -> dict[str, float]:
+    """Noise of a reading of each channel, with its resolution, SI units.
+
+    Args:
+        model: its sensing parameters. That of the speed is for the mean over a pulse interval.
+    """
+    s = model.sensing
+
+    def of(name: str) -> float:
+        return max(math.hypot(s[f"{name}_noise"], s[f"{name}_lsb"] / math.sqrt(12.0)), 1e-9)
+
+    return {"theta": of("angle"), "i_a": of("current"), "v_a": of("voltage")}
+
+
+class _Members:
+    """Models that run side by side in one stage, prepared for compiled code."""
+
+    def __init__(self, models: Sequence[Model], period: float) -> None:
+        self.c, self.e, self.x, self.chain, self.states = List(), List(), List(), List(), List()
+        self.added: Any = None
+        for m in models:
+            c, e, x, self.added = dynamics.prepare(m, period, full=True)
+            self.c.append(c)
+            self.e.append(e)
+            self.x.append(x)
+            self.chain.append(sensing.prepare(m, period))
+            self.states.append(dynamics.State())
+
+    def start(self, state: dynamics.State) -> None:
+        """Set all to a state."""
+        for j in range(len(self.states)):
+            self.states[j] = state
+
+    @property
+    def compiled(self) -> Any:
+        """What compiled functions take, in their order."""
+        return self.states, self.c, self.e, self.x, self.chain, self.added
+
+
+@njit(nogil=True)
+def _motor(v: Array, i_a: Array, omega: Array, states: Any, c: Any, e: Any, x: Any, chain: Any, added: Any,  # type: ignore[no-untyped-def]
+           ring: Array, memory: Array, current: Array, pulse: Array, noise_of: Array, speed: Array):
+    """Advance the motors of a stage by N samples.
+
+    Args:
+        v: (N + 1,) [V] voltage read, the sample before first. i_a, omega: (N,) read.
+        states, c, e, x, chain, added: of `_Members`.
+        ring: (M, TURNS) [rad] angles of the rotors at the last samples.
+        memory: samples so far, last speed read, instant of the last pulse [s], is it known, last three errors [rad/s],
+            last true interval [s].
+        current: (N, M), filled with the residuals of the current [A].
+        pulse: (N, M), filled with the residuals of the mean speed [rad/s]; NaN where no pulse came.
+        noise_of: (N,), filled with the noise of the mean speed [rad/s].
+        speed: (N,), filled with the speed that drives the arm [rad/s].
+
+    Returns:
+        False captures, and pulses.
+    """
+    n, size = i_a.shape[0], current.shape[1]
+    h = chain[0].h
+    step = 2.0 * math.pi / chain[0].pulses if chain[0].pulses > 0.0 else 0.0
+    spikes = pulses = 0
+    for k in range(n):
+        count = int(memory[0])
+        now = count * h
+        for j in range(size):
+            bias = chain[j].voltage_bias
+            s = states[j]
+            for _ in range(c[j].steps):
+                past = None if added is None else dynamics.pasts(s, v[k] - bias, c[j], added)
+                i1, _, w1, angle, heat = dynamics.advance_motor(s, v[k] - bias, past, c[j], e[j], x[j], added)
+                after = dynamics.State(i1, w1, angle, 0.0, 0.0, 0.0, heat, 0.0, 0.0, 0.0, s.time, s.memory)
+                if added is not None and past is not None:
+                    after = dynamics.since(after, dynamics.past_after(s, after, v[k] - bias, past, c[j], added))
+                s = after
+            states[j] = s
+            ring[j, count % ring.shape[1]] = s.rotor_angle
+            current[k, j] = i_a[k] - (chain[j].current_factor * s.i_a + chain[j].current_bias)
+            pulse[k, j] = math.nan
+        reading, before = omega[k], memory[1]
+        noise_of[k] = 1.0
+        if math.isnan(reading):
+            memory[3] = 0.0
+        elif step == 0.0:  # a speed that is sampled directly
+            for j in range(size):
+                pulse[k, j] = reading - states[j].omega
+            noise_of[k] = max(chain[0].speed_noise, 1e-3 * abs(reading) + 1e-3)
+            _remember(memory, pulse[k, 0])
+            pulses += 1
+        elif reading != before and reading > 0.0:
+            interval = step / reading
+            at, known = now - 0.5 * h, False
+            if memory[3] > 0.0:
+                expected = memory[2] + interval
+                held = step / before if before > 0.0 else 0.0
+                turns = 0
+                while held > 0.0 and expected < now - (1.0 + SLACK) * h and turns < 1000:  # equal readings between
+                    expected += held
+                    turns += 1
+                if abs(expected - (now - 0.5 * h)) <= (0.5 + SLACK) * h:
+                    at, known = min(max(expected, now - h), now), True
+            false = memory[3] > 0.0 and not known
+            memory[2], memory[3] = at, 1.0
+            if false:
+                spikes += 1
+            elif interval < (ring.shape[1] - 2) * h and count * h > interval:
+                for j in range(size):
+                    end, begin = _turned(ring, j, at, count, h), _turned(ring, j, at - interval, count, h)
+                    pulse[k, j] = reading - (end - begin) / interval
+                tick = chain[0].tick / math.sqrt(6.0)
+                noise_of[k] = math.sqrt((reading * tick / interval) ** 2 + chain[0].speed_noise ** 2
+                                        + (2e-3 * reading) ** 2)
+                _remember(memory, pulse[k, 0])
+                pulses += 1
+        elif reading == 0.0 and count % 50 == 0 and now > sensing.SPEED_TIMEOUT:  # slower than a pulse in the timeout
+            slowest = step / sensing.SPEED_TIMEOUT
+            back = int(sensing.SPEED_TIMEOUT / h)
+            for j in range(size):
+                mean = (ring[j, count % ring.shape[1]] - ring[j, (count - back) % ring.shape[1]]) / (back * h)
+                pulse[k, j] = -max(mean - 1.5 * slowest, 0.0)
+            noise_of[k] = 1.0
+            memory[4] = memory[5] = memory[6] = pulse[k, 0]
+            memory[3] = 0.0
+        memory[1] = reading
+        memory[0] += 1.0
+        a, b, d = memory[4], memory[5], memory[6]
+        median = max(min(a, b), min(max(a, b), d))
+        speed[k] = states[0].omega + median
+    return spikes, pulses
+
+
+@njit(nogil=True)
+def _remember(memory: Array, error: float) -> None:
+    memory[4], memory[5], memory[6] = memory[5], memory[6], error
+
+
+@njit(nogil=True)
+def _turned(ring: Array, j: int, t: float, count: int, h: float) -> float:
+    """[rad] Angle of rotor j at a time, linear between samples; `count` is the number of the last sample."""
+    at = min(max(t / h, count - ring.shape[1] + 2.0), float(count))
+    first = int(at)
+    share = at - first
+    a = ring[j, first % ring.shape[1]]
+    b = ring[j, min(first + 1, count) % ring.shape[1]]
+    return a + share * (b - a)
+
+
+@njit(nogil=True)
+def _arm(theta: Array, speed: Array, gains: Array, stages: Array, states: Any, c: Any, e: Any, x: Any, chain: Any,  # type: ignore[no-untyped-def]
+         added: Any, out: Array):
+    """Advance the observers of the arm by N samples.
+
+    Args:
+        theta: (N,) [rad] angle read.
+        speed: (N + 1,) [rad/s] speed of the rotor, the sample before first.
+        gains: (2,) of the observer: [1], [1/s].
+        stages: (M, 2) states of the angle's filter.
+        states, c, e, x, chain, added: of `_Members`.
+        out: (N, M), filled with the innovations [rad].
+    """
+    n, size = theta.shape[0], out.shape[1]
+    for k in range(n):
+        for j in range(size):
+            s = states[j]
+            before = s
+            w = speed[k]
+            rise = (speed[k + 1] - w) / c[j].steps
+            for _ in range(c[j].steps):
+                now = dynamics.State(0.0, w, 0.0, s.theta, s.theta_dot, s.thrust, 0.0, s.flex, s.flex_dot, 0.0, s.time,
+                                     s.memory)
+                past = None if added is None else dynamics.pasts(now, 0.0, c[j], added)
+                m, f1 = dynamics.advance_arm(now, w + 0.5 * rise, w + rise, past, c[j], e[j], x[j], added)
+                w += rise
+                after = dynamics.State(0.0, w, 0.0, m.theta, m.theta_dot, f1, 0.0, m.flex, m.flex_dot, 0.0, now.time,
+                                       now.memory)
+                if added is not None and past is not None:
+                    after = dynamics.since(after, dynamics.past_after(now, after, 0.0, past, c[j], added))
+                s = after
+            held = sensing.Memory(stages[j, 0], stages[j, 1], before.theta, before.theta_dot, 0.0, 0.0, 0.0, 0.0, 0.0)
+            first, second = sensing.filter_angle(held, s.theta, s.theta_dot, chain[j])
+            error = theta[k] - second
+            out[k, j] = error
+            if math.isnan(error):
+                error = 0.0
+            states[j] = dynamics.State(0.0, s.omega, 0.0, s.theta + gains[0] * error, s.theta_dot + gains[1] * error,
+                                       s.thrust, 0.0, s.flex, s.flex_dot, 0.0, s.time, s.memory)
+            stages[j, 0], stages[j, 1] = first + gains[0] * error, second + gains[0] * error
+
+
+@njit(nogil=True)
+def _free(v: Array, states: Any, c: Any, e: Any, x: Any, chain: Any, added: Any, stages: Array, out: Array) -> None:
+    """Advance the whole chain by N holds of the voltage; out (4, N) gets θ, ω, i_a read and v_a at the terminals."""
+    for k in range(out.shape[1]):
+        s = states[0]
+        out[0, k] = stages[0, 1]
+        out[1, k] = s.omega
+        out[2, k] = chain[0].current_factor * s.i_a + chain[0].current_bias
+        out[3, k] = v[k] - e[0].supply_sag_r_supply * s.i_a + chain[0].voltage_bias
+        before = s
+        for _ in range(c[0].steps):
+            s = dynamics.advance(s, v[k], c[0], e[0], x[0], added)
+        held = sensing.Memory(stages[0, 0], stages[0, 1], before.theta, before.theta_dot, 0.0, 0.0, 0.0, 0.0, 0.0)
+        stages[0, 0], stages[0, 1] = sensing.filter_angle(held, s.theta, s.theta_dot, chain[0])
+        states[0] = s
+
+
+class Companion:
+    """The model of a rig beside its samples.
+
+    Args:
+        model: the nominal model.
+        columns: of the bank; none: residuals of the nominal model alone.
+        period: [s] time between samples.
+    """
+
+    def __init__(self, model: Model, columns: Sequence[Column], period: float = SAMPLE_PERIOD) -> None:
+        self.model, self.period = model, period
+        self.columns = {stage: [c for c in columns if stage in c.stages] for stage in ("actuator", "motor", "arm")}
+        models = {stage: [model, *(c.model(model) for c in own)] for stage, own in self.columns.items()}
+        self._actuators = models["actuator"]
+        self._numbers = [m.numbers() for m in self._actuators]
+        behind = [actuator.behind_terminals(m) for m in models["motor"]]
+        self._motor = _Members(behind, period)
+        self._arm = _Members(models["arm"], period)
+        self._chain = _Members([model], period)
+        longest = max(m.effect("command_delay", "delay") for m in self._actuators)
+        self._history = math.ceil(longest / period) + 2
+        noises = noise(model)
+        self._noise = np.array([noises["v_a"], noises["i_a"], 1.0, noises["theta"]])
+        gravity, damping = model.numbers()["mgd_over_J"], model.numbers()["c_over_J"]
+        rate = OBSERVER_RATE * math.sqrt(gravity / REFERENCE_GRAVITY)
+        first = max(2.0 * OBSERVER_DAMPING * rate - damping, 0.0)
+        self._gains = np.array([first * period, max(rate * rate - gravity - damping * first, 0.0) * period])
+        self.floors = {**noises, "omega": max(model.sensing["speed_noise"], 1.0)}
+        self.running = False
+
+    def restart(self) -> None:
+        """Forget the past: the next sample is the first one."""
+        self.running = False
+
+    def _start(self, s: Samples) -> None:
+        """Begin at the first sample, as if all had been so for long."""
+        def first(x: Array, default: float = 0.0) -> float:
+            known = x[np.isfinite(x)]
+            return float(known[0]) if len(known) else default
+
+        numbers = self.model.numbers()
+        theta, omega, i_a = first(s.theta), first(s.omega), first(s.i_a)
+        duty = first(s.duty)
+        zero = self.model.effect("angle_offset", "bias")
+        thrust = float(actuator.thrust(numbers, omega))
+        self._past = np.full(self._history, duty)
+        self._count = 0
+        self._last_v = first(s.v_a, float(actuator.voltage(numbers, duty)))
+        self._last_i, self._last_speed = i_a, omega
+        self._motor.start(dynamics.State(i_a=i_a, omega=omega))
+        self._ring = np.zeros((len(self._motor.states), TURNS))
+        self._memory = np.zeros(8)
+        self._memory[1] = omega
+        self._arm.start(dynamics.State(omega=omega, theta=theta - zero, thrust=thrust))
+        self._chain.start(dynamics.State(i_a=i_a, omega=omega, theta=theta - zero, thrust=thrust))
+        self._stages = np.full((len(self._arm.states), 2), theta)
+        self._free_stages = np.full((1, 2), theta)
+        self.running = True
+
+    def step(self, samples: Samples) -> Residuals:
+        """Advance by some samples.
+
+        Args:
+            samples: consecutive; NaN where a reading is missing. A missing voltage is held.
+        """
+        if not self.running:
+            self._start(samples)
+        n = len(samples.theta)
+        duty = _held(samples.duty, float(self._past[-1]))
+        i_a = _held(samples.i_a, self._last_i)
+        known = np.concatenate([self._past, duty])
+        start = self._count - len(self._past)
+        volts, acting = [], np.zeros(n)
+        for m, numbers in zip(self._actuators, self._numbers, strict=True):
+            acts, read = (x[len(self._past):] for x in actuator.voltages(numbers, known, m.effects, self.period, start))
+            if m is self.model:
+                acting = acts
+            volts.append(sensing.read_voltage(m, actuator.terminal_voltage(m, read, i_a, self.period)))
+        self._past = known[-self._history:]
+        v_rows = (samples.v_a[:, None] - np.array(volts).T) / self._noise[0]
+        v = np.concatenate([[self._last_v], np.where(np.isfinite(samples.v_a), samples.v_a, volts[0])])
+
+        size = len(self._motor.states)
+        current, pulse, noise_of, speed = np.empty((n, size)), np.empty((n, size)), np.empty(n), np.empty(n)
+        spikes, pulses = _motor(v, samples.i_a, samples.omega, *self._motor.compiled, self._ring, self._memory, current,
+                                pulse, noise_of, speed)
+        current /= self._noise[1]
+        pulse /= noise_of[:, None]
+
+        out = np.empty((n, len(self._arm.states)))
+        _arm(samples.theta, np.concatenate([[self._last_speed], speed]), self._gains, self._stages,
+             *self._arm.compiled, out)
+        out /= self._noise[3]
+
+        said = np.empty((4, n))
+        _free(acting, *self._chain.compiled, self._free_stages, said)
+        self._count += n
+        self._last_v, self._last_i, self._last_speed = float(v[-1]), float(i_a[-1]), float(speed[-1])
+        rows = {"actuator": _rows((v_rows, 0)), "motor": _rows((current, 1), (pulse, 2)), "arm": _rows((out, 3))}
+        return Residuals({k: r[0] for k, r in rows.items()}, {k: r[1] for k, r in rows.items()},
+                         {k: r[2] for k, r in rows.items()}, spikes, pulses,
+                         Samples(said[0], said[1], said[2], said[3], duty))
+
+
+def _held(x: Array, before: float) -> Array:
+    """A series without NaN: what is missing keeps the value before it."""
+    if np.isfinite(x).all():
+        return x
+    at = np.maximum.accumulate(np.where(np.isfinite(x), np.arange(1, len(x) + 1), 0))
+    return np.asarray(np.concatenate([[before], x])[at])
+
+
+def _rows(*parts: tuple[Array, int]) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
+    """Rows of some channels without those that were not read, their channels, and their samples."""
+    rows, channels, at = [], [], []
+    for values, channel in parts:
+        there = np.flatnonzero(np.isfinite(values).all(axis=1))
+        rows.append(values[there])
+        channels.append(np.full(len(there), channel))
+        at.append(there)
+    return np.concatenate(rows), np.concatenate(channels), np.concatenate(at)

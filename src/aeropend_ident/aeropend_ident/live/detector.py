@@ -1,0 +1,463 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sequential detection of effects that begin while a rig runs: when, where and which.
+
+What the stages leave (`companion_model`) is, to first order, linear in the sizes of the parameters and effects of the
+bank. A Kalman filter tracks all sizes within what a rig may have, as an Ornstein-Uhlenbeck process; so a winding that
+warms up is no change. Beside it, for each instant of a window, each size is tried as if it had jumped there: the
+generalised likelihood ratio of A. Willsky and H. Jones (A generalized likelihood ratio approach to the detection and
+estimation of jumps in linear systems. IEEE Transactions on Automatic Control 21, 1976), see M. Basseville and
+I. Nikiforov (Detection of Abrupt Changes, 1993, chapter 7). The unknown size costs its Occam factor, as in the
+diagnosis.
+
+Effects of chance change the variance, not the mean. For them there are cumulative sums of the log likelihood ratio
+(CUSUM, E. Page 1954); their mean time between false alarms is at least exp(limit) blocks (G. Lorden: Procedures for
+reacting to a change in distribution. Annals of Mathematical Statistics 42, 1971).
+
+The limit of the likelihood ratios is a matter of the colour of the residuals, which no formula knows; `false_alarms`
+has it as measured on nominal rigs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeropend_ident.diagnosis.chain.priors import SIZE_SD
+from aeropend_ident.diagnosis.chain.values import PLACE_OF_CHANNEL
+from aeropend_ident.diagnosis.search.hypotheses import EFFECT_ODDS
+from aeropend_ident.live.bank import Column
+from aeropend_ident.live.companion_model import CHANNELS, Residuals
+
+Array = NDArray[np.float64]
+
+TICK = 0.1
+"""[s] Time between two instants that are tried (choice: a fifth of what an instant must be told within)."""
+
+WINDOW = 20.0
+"""[s] Longest time back for which an instant is tried (choice: the time within which an effect must be named)."""
+
+GUARD = 0.3
+"""[s] Time after an instant that is left out.
+
+Choice: the columns are those of effects that have long been there; observer and rotor settle in about this time."""
+
+GROWTH = 1.25
+"""Ratio of the ages of two instants that are tried (choice: a likelihood ratio loses a tenth in between at most)."""
+
+DRIFT = 600.0
+"""[s] Time constant with which sizes wander within what a rig may have.
+
+Choice: windings warm up and batteries drain in minutes, not in seconds."""
+
+BLOCK = 0.5
+"""[s] Length of the blocks over which the variance of sums is measured (choice: longer than the observer remembers)."""
+
+LEARNING = 60.0
+"""[s] Time constant with which the variance of a channel is learned (choice: several references)."""
+
+LEAST_GAP = 0.15
+"""[floors] Lasting gap in a channel that is never material (choice).
+
+Linearised models of a rig whose numbers are 5 % off leave about so much."""
+
+ROBUST = 9.0
+"""Largest square of a sum, in variances, that is learned from (convention: three standard deviations)."""
+
+MORE = 4.0
+"""Ratio of the variances that the cumulative sum of a channel tells apart (choice: twice the floor)."""
+
+SPIKES = (0.02, 0.3)
+"""[1/s] Rates of false captures that the cumulative sum tells apart (choice: of a good rig, of a bad one)."""
+
+SETTLES = 3.0
+"""[s] Time after a start in which nothing is judged (choice: the slowest start of rotor and observer)."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A hypothesis on a change.
+
+    Attributes:
+        hypothesis: effect, or `parameter_mismatch:NAME`.
+        place: of the chain.
+        evidence: log likelihood ratio against no change, with Occam factor and prior odds.
+        size: change of the size, SI.
+        since: [s] instant, in the time of the detector.
+        gap: [floors] RMS that the change makes in the channels of its stage.
+        probability: among all hypotheses on a change.
+    """
+
+    hypothesis: str
+    place: str
+    evidence: float
+    size: float
+    since: float
+    gap: float
+    probability: float = 0.0
+
+
+@dataclass(frozen=True)
+class PlaceState:
+    """What is known of one place.
+
+    Attributes:
+        gap: [floors] that the likeliest change there makes.
+        limit: [floors] gap at which that change would be an alarm; inf: the rig is not excited enough to say.
+        excited: whether a change of a usual size would show.
+    """
+
+    gap: float
+    limit: float
+    excited: bool
+
+
+@dataclass
+class _Snapshot:
+    """State of a stage at an instant: prior information, and sums since the start."""
+
+    tick: int
+    information: Array
+    pull: Array
+    products: Array
+    cross: Array
+    squares: Array
+    rows: float
+
+
+class _Stage:
+    """Tracking of the sizes of one stage."""
+
+    def __init__(self, columns: Sequence[Column], tick: float) -> None:
+        self.columns = list(columns)
+        d = len(self.columns)
+        self.scale = np.array([c.sd / c.step for c in self.columns])
+        self.keep = math.exp(-tick / DRIFT)
+        self.x, self.p = np.zeros(d), np.eye(d)
+        self.products, self.cross, self.squares, self.rows = np.zeros((d, d)), np.zeros(d), np.zeros(d), 0.0
+        self.snapshots: deque[_Snapshot] = deque(maxlen=round(WINDOW / tick) + 1)
+
+    def linear(self, rows: Array) -> tuple[Array, Array]:
+        """Residuals (R,) of the nominal model and sensitivities (R, D) to the sizes in their standard deviations."""
+        r = rows[:, 0]
+        return r, (r[:, None] - rows[:, 1:]) * self.scale
+
+    def update(self, r: Array, j: Array, weight: Array) -> Array:
+        """Take the rows of a tick; returns what the sizes tracked so far leave of them."""
+        left = r - j @ self.x
+        wj = j * weight[:, None]
+        n, y = wj.T @ j, wj.T @ r
+        d = len(self.x)
+        p = self.keep**2 * self.p + (1.0 - self.keep**2) * np.eye(d)
+        x = self.keep * self.x
+        p = np.linalg.solve(np.eye(d) + p @ n, p)
+        self.p = 0.5 * (p + p.T)
+        self.x = x + self.p @ (y - n @ x)
+        self.products = self.products + n
+        self.cross = self.cross + y
+        self.squares = self.squares + (j * j).sum(axis=0)
+        self.rows += len(r)
+        return np.asarray(left)
+
+    def snapshot(self, tick: int) -> None:
+        """Remember this instant."""
+        information = np.linalg.inv(self.p)
+        self.snapshots.append(_Snapshot(tick, np.asarray(information), information @ self.x, self.products, self.cross,
+                                        self.squares, self.rows))
+
+    def scores(self, pairs: Sequence[tuple[_Snapshot, _Snapshot]]) -> tuple[Array, Array, Array]:
+        """Score and information (K, D) of a jump of each size at each instant, and the mean square of its column.
+
+        Args:
+            pairs: the instant, and the end of its guard.
+        """
+        n = self.products - np.array([b.products for _, b in pairs])
+        y = self.cross - np.array([b.cross for _, b in pairs])
+        a = np.array([s.information for s, _ in pairs]) + n
+        b = np.array([s.pull for s, _ in pairs]) + y
+        solved = np.linalg.solve(a, np.concatenate([n, b[:, :, None]], axis=2))
+        score = y - np.einsum("kij,kj->ki", n, solved[:, :, -1])
+        information = np.einsum("kii->ki", n) - np.einsum("kij,kji->ki", n, solved[:, :, :-1])
+        rows = np.maximum(self.rows - np.array([b.rows for _, b in pairs]), 1.0)
+        mean = (self.squares - np.array([b.squares for _, b in pairs])) / rows[:, None]
+        return score, np.maximum(information, 0.0), mean
+
+    def reset(self) -> None:
+        """Forget the instants, and keep the sizes."""
+        self.snapshots.clear()
+
+
+class _Variance:
+    """Variance of the sums of a channel, learned with a delay, and the cumulative sum that tells when it grows."""
+
+    def __init__(self) -> None:
+        self.value, self.blocks, self.sum, self.unsure, self.n = 1.0, 0, 0.0, 0.0, 0
+        self.waiting: deque[tuple[float, float]] = deque()
+        self.cusum, self.since = 0.0, 0.0
+
+    @property
+    def weight(self) -> float:
+        """Of a row: over the variance of a sum, which is at least that of a gap that is never material."""
+        return 1.0 / (self.value + LEAST_GAP**2 * self.typical)
+
+    typical = 245.0
+
+    def add(self, left: Array, unsure: float) -> None:
+        """Take what is left of some rows, and the variance of their sum that unknown sizes make."""
+        self.sum += float(np.clip(left, -1e6, 1e6).sum())
+        self.unsure += math.sqrt(unsure)
+        self.n += len(left)
+
+    def close(self, time: float, learn: bool) -> None:
+        """End a block."""
+        if self.n == 0:
+            return
+        self.typical += (self.n - self.typical) / min(self.blocks + 1, 100)
+        z, unsure = self.sum * self.sum / self.n, self.unsure**2 / self.n
+        expected = self.value + LEAST_GAP**2 * self.n + unsure
+        learn = learn and unsure < expected - unsure
+        gain = 0.5 * (min(z / expected, 1e4) * (1.0 - 1.0 / MORE) - math.log(MORE))
+        if self.cusum <= 0.0:
+            self.since = time - BLOCK
+        self.cusum = max(0.0, self.cusum + gain)
+        self.waiting.append((time, z))
+        while self.waiting and (time - self.waiting[0][0] > WINDOW or self.blocks < 2.0 * WINDOW / BLOCK):
+            _, z = self.waiting.popleft()
+            if learn:
+                self.blocks += 1
+                share = max(BLOCK / LEARNING, 1.0 / (self.blocks + 1))
+                self.value += share * (min(z, ROBUST * max(self.value, 1.0)) - self.value)
+                self.value = max(self.value, 1.0)
+        self.sum, self.unsure, self.n = 0.0, 0.0, 0
+
+
+class Detector:
+    """Tells when a rig and its model part.
+
+    Args:
+        columns: of the bank.
+        limit: of the log likelihood ratios; see `false_alarms.limit`.
+    """
+
+    def __init__(self, columns: Sequence[Column], limit: float) -> None:
+        self.columns, self.limit = list(columns), limit
+        self.stages = {b: _Stage([c for c in columns if b in c.stages], TICK) for b in ("actuator", "motor", "arm")}
+        self.variance = [_Variance() for _ in CHANNELS]
+        self.time = 0.0
+        self.tick = 0
+        self.settled_at = SETTLES
+        self.spikes, self.spikes_since = 0.0, 0.0
+        self.ages = sorted({round(a) for a in GUARD / TICK + 1 + GROWTH ** np.arange(0, 40)
+                            if a < WINDOW / TICK})
+        self.alarm: Finding | None = None
+        self.alarm_at = 0.0
+        self.findings: list[Finding] = []
+        self.gaps = np.zeros(len(CHANNELS))
+        self._frozen: dict[str, list[tuple[_Snapshot, _Snapshot]]] = {}
+        self._pending: list[Residuals] = []
+        self._pending_s = 0.0
+        self.statistic = 0.0
+        self._shown: dict[str, PlaceState] = {}
+
+    # ---- samples
+
+    def step(self, residuals: Residuals, seconds: float, moving: bool = True) -> bool:
+        """Take what some samples leave.
+
+        Args:
+            residuals: of the companion.
+            seconds: [s] their duration.
+            moving: whether to learn from them.
+
+        Returns:
+            Whether a tick has ended.
+        """
+        self._pending.append(residuals)
+        self._pending_s += seconds
+        if self._pending_s < TICK - 1e-3:
+            return False
+        pending, self._pending = self._pending, []
+        span, self._pending_s = self._pending_s, 0.0
+        self.time += span
+        self.tick += 1
+        judged = self.time > self.settled_at
+        weights = np.array([v.weight for v in self.variance])
+        square, count = np.zeros(len(CHANNELS)), np.zeros(len(CHANNELS))
+        for name, stage in self.stages.items():
+            rows = np.concatenate([p.rows[name] for p in pending])
+            channel = np.concatenate([p.channel[name] for p in pending])
+            r, j = stage.linear(np.clip(rows, -1e4, 1e4))
+            for c in set(channel.tolist()):
+                mine = r[channel == c]
+                square[c], count[c] = float(mine @ mine), len(mine)
+            if judged and len(r):
+                before = stage.p
+                left = stage.update(r, j, weights[channel])
+                for c in set(channel.tolist()):
+                    total = j[channel == c].sum(axis=0)
+                    self.variance[c].add(left[channel == c], max(float(total @ before @ total), 0.0))
+            stage.snapshot(self.tick)
+        share = 1.0 - math.exp(-span / 1.0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            now = np.where(count > 0, square / np.maximum(count, 1), self.gaps**2)
+        self.gaps = np.sqrt(self.gaps**2 + share * (now - self.gaps**2))
+        spikes = sum(p.spikes for p in pending)
+        if judged:
+            if self.spikes <= 0.0:
+                self.spikes_since = self.time - span
+            low, high = SPIKES
+            self.spikes = max(0.0, self.spikes + spikes * math.log(high / low) - (high - low) * span)
+        if self.tick % round(BLOCK / TICK) == 0 and judged:
+            for v in self.variance:
+                v.close(self.time, learn=moving)
+        return True
+
+    # ---- judgement
+
+    def judge(self) -> Finding | None:
+        """Look for a change; returns it when it is new."""
+        self.findings = self.changes()
+        self.statistic = max((f.evidence for f in self.findings), default=0.0)
+        if self.alarm is None and self.findings and self.statistic > self.limit:
+            self._freeze(self.findings[0].since)
+            self.findings = self.changes()
+            self.alarm, self.alarm_at = self.findings[0], self.time
+            return self.alarm
+        if self.alarm is not None and self.findings and self.time < self.alarm_at + 3.0 * WINDOW:
+            best = self.findings[0]
+            if best.evidence > self.alarm.evidence or best.hypothesis == self.alarm.hypothesis:
+                self.alarm = best
+        return None
+
+    def _show(self, shown: dict[str, PlaceState], c: Column, information: Array, size: Array, mean: Array, k: int
+              ) -> None:
+        """Note the least gap that a column would show, and the gap that it makes now."""
+        at = int(np.argmax(information))
+        needed = self.limit + 0.5 * math.log1p(information[at] * (c.wide / c.sd) ** 2) - c.log_odds
+        least = math.sqrt(2.0 * needed / max(information[at], 1e-12))  # in standard deviations of the size
+        limit = max(least * math.sqrt(mean[at]), 1e-9)
+        gap = abs(float(size[k])) * math.sqrt(mean[k])
+        excited = least * c.sd < c.wide / SIZE_SD
+        before = shown.get(c.place)
+        if before is None or (excited, gap / limit) > (before.excited, before.gap / before.limit):
+            shown[c.place] = PlaceState(gap, limit, excited or (before is not None and before.excited))
+
+    def _pairs(self, stage: _Stage) -> list[tuple[_Snapshot, _Snapshot]]:
+        held, guard = stage.snapshots, round(GUARD / TICK)
+        oldest = len(held) - 1
+        return [(held[oldest - a], held[oldest - a + guard]) for a in self.ages if a <= oldest]
+
+    def _freeze(self, since: float) -> None:
+        """Keep the instants around one, so that it can be judged with what comes later."""
+        guard = round(GUARD / TICK)
+        for name, stage in self.stages.items():
+            held = list(stage.snapshots)
+            last = len(held) - 1 - guard
+            near = [k for k in range(last) if abs(self._time_of(held[k].tick) - since) < 2.0]
+            self._frozen[name] = [(held[k], held[k + guard]) for k in near] or self._pairs(stage)
+
+    def _time_of(self, tick: int) -> float:
+        return self.time - (self.tick - tick) * TICK
+
+    def changes(self) -> list[Finding]:
+        """All hypotheses on a change, the likeliest first, each at its likeliest instant."""
+        table: dict[tuple[str, tuple[tuple[str, float], ...]], list[tuple[Array, Array, Array]]] = {}
+        column_of = {}
+        ticks: list[int] = []
+        for name, stage in self.stages.items():
+            pairs = self._frozen.get(name) or self._pairs(stage)
+            if not pairs:
+                return []
+            ticks = [s.tick for s, _ in pairs]
+            score, information, mean = stage.scores(pairs)
+            for k, c in enumerate(stage.columns):
+                table.setdefault((c.hypothesis, c.values), []).append((score[:, k], information[:, k], mean[:, k]))
+                column_of[(c.hypothesis, c.values)] = c
+        best: dict[str, Finding] = {}
+        total: dict[str, float] = {}
+        shown: dict[str, PlaceState] = {}
+        for which, parts in table.items():
+            c = column_of[which]
+            if c.wide <= 0.0:
+                continue
+            score, information = (np.sum([p[i] for p in parts], axis=0) for i in (0, 1))
+            mean = np.max([p[2] for p in parts], axis=0)
+            ratio = (c.wide / c.sd) ** 2
+            size = score / (information + 1.0 / ratio)
+            evidence = 0.5 * score * size - 0.5 * np.log1p(information * ratio) + c.log_odds
+            if c.sign:
+                evidence = np.where(size * c.sign > 0.0, evidence, -np.inf)
+            k = int(np.argmax(evidence))
+            self._show(shown, c, information, size, mean, k)
+            if not np.isfinite(evidence[k]):
+                continue
+            total[c.hypothesis] = np.logaddexp(total.get(c.hypothesis, -np.inf), np.logaddexp.reduce(evidence))
+            if c.hypothesis not in best or evidence[k] > best[c.hypothesis].evidence:
+                best[c.hypothesis] = Finding(
+                    c.hypothesis, c.place, float(evidence[k]), float(size[k] * c.sd), self._time_of(ticks[k]),
+                    float(abs(size[k]) * math.sqrt(mean[k])))
+        self._shown = shown
+        for f in self._random():
+            best[f.hypothesis], total[f.hypothesis] = f, f.evidence
+        top = max(total.values(), default=0.0)
+        norm = sum(math.exp(v - top) for v in total.values())
+        found = [Finding(f.hypothesis, f.place, f.evidence, f.size, f.since, f.gap,
+                         math.exp(total[f.hypothesis] - top) / norm) for f in best.values()]
+        return sorted(found, key=lambda f: -f.evidence)
+
+    def shows(self, place: str) -> PlaceState:
+        """What a place shows in the window.
+
+        Args:
+            place: of the chain.
+        """
+        return self._shown.get(place, PlaceState(0.0, math.inf, False))
+
+    def drifted(self, beyond: float) -> dict[str, tuple[str, float]]:
+        """Places with a size that is surely further from nominal than a rig's may be: hypothesis, and size.
+
+        Args:
+            beyond: standard deviations of what a rig may have.
+        """
+        found: dict[str, tuple[str, float]] = {}
+        for stage in self.stages.values():
+            surely = np.abs(stage.x) - 2.0 * np.sqrt(np.diag(stage.p))
+            for k in np.argsort(surely):
+                c = stage.columns[k]
+                if surely[k] > beyond and c.wide > 0.0:
+                    found[c.place] = c.hypothesis, float(stage.x[k] * c.sd)
+        return found
+
+    def _random(self) -> list[Finding]:
+        """The effects of chance, by their cumulative sums."""
+        found = []
+        odds = math.log(EFFECT_ODDS)
+        if self.spikes > 0.0:
+            found.append(Finding("speed_spikes", "sensing", self.spikes + odds, math.nan, self.spikes_since, 0.0))
+        for c, v in zip(CHANNELS, self.variance, strict=True):
+            if v.cusum > 0.0:
+                name = "gust" if c == "theta" else f"unknown:{c}"
+                found.append(Finding(name, PLACE_OF_CHANNEL[c], v.cusum + odds, math.nan, v.since, 0.0))
+        return found
+
+    def clear(self) -> None:
+        """Take the rig as it is now: forget the alarm and the instants, and keep the sizes tracked."""
+        self.alarm = None
+        self._frozen = {}
+        for stage in self.stages.values():
+            stage.reset()
+        for v in self.variance:
+            v.cusum = 0.0
+            v.waiting.clear()
+        self.spikes = 0.0
+
+    def restart(self) -> None:
+        """The samples were interrupted: settle again. An alarm stays."""
+        self.settled_at = self.time + SETTLES
+        self._pending, self._pending_s = [], 0.0
+        for stage in self.stages.values():
+            stage.reset()

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The model beside the rig without ROS: samples in; what the model says, and the state of each place, out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from aeropend_ident.diagnosis.chain.values import PLACE_OF_CHANNEL
+from aeropend_ident.live.bank import columns
+from aeropend_ident.live.companion_model import CHANNELS, Companion, Residuals
+from aeropend_ident.live.detector import TICK, Detector, Finding
+from aeropend_ident.live.false_alarms import limit
+from aeropend_ident.live.intake import Batch
+from aeropend_sim.model.effects import PLACES
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+
+JUDGED = 2
+"""Ticks between two judgements (choice: 0.2 s, a tenth of what a detection may take)."""
+
+OUT_OF_RANGE = 3.0
+"""Standard deviations of its prior beyond which a number that is tracked is material (convention: as in the
+diagnosis)."""
+
+OK, NOT_EXCITED, DRIFTED, PARTED, STALE = "ok", "not excited enough to say", "drifted", "parted", "stale"
+"""States of a place."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """State of one place of the chain.
+
+    Attributes:
+        state: one of the states above.
+        gap: [floors] that the likeliest change at this place makes now.
+        limit: [floors] at which it is an alarm; inf: none would show.
+        residual: [floors] RMS of measured minus model in the channel that shows the place first.
+        effect: the likeliest effect, "" if none is likely.
+        probability: of this effect among all changes.
+        size: of this effect, SI; NaN of an effect of chance.
+        since_ns: stamp of the begin; 0 if nothing has begun.
+    """
+
+    state: str
+    gap: float = 0.0
+    limit: float = math.inf
+    residual: float = 0.0
+    effect: str = ""
+    probability: float = 0.0
+    size: float = math.nan
+    since_ns: int = 0
+
+
+class Watcher:
+    """Companion and detector of one rig.
+
+    Args:
+        model: the nominal model.
+        mean_hours: [h] mean time between two false alarms.
+
+    Attributes:
+        alarm: the change that was found, until `clear`.
+        places: state of each place.
+        free_gap: [floors] RMS of measured minus free-running model by channel, over about the last second.
+        note: why nothing is judged at present; "" if it is.
+    """
+
+    def __init__(self, model: Model, mean_hours: float = 24.0, period: float = SAMPLE_PERIOD) -> None:
+        self.model, self.period = model, period
+        bank = columns(model)
+        self.companion = Companion(model, bank, period)
+        self.detector = Detector(bank, limit(mean_hours))
+        self.places = {place: Place(STALE) for place in PLACES}
+        self.free_gap = dict.fromkeys(CHANNELS, 0.0)
+        self.note = "no sample yet"
+        self.breaks = 0
+        self._epoch_ns = 0  # stamp at time 0 of the detector
+
+    @property
+    def alarm(self) -> Finding | None:
+        """The change that was found, until `clear`."""
+        return self.detector.alarm
+
+    def stamp_of(self, seconds: float) -> int:
+        """[ns] Stamp of a time of the detector."""
+        return self._epoch_ns + round(seconds * 1e9)
+
+    def step(self, batch: Batch, *, frozen: bool = False) -> tuple[Residuals, Finding | None]:
+        """Take some samples.
+
+        Args:
+            batch: consecutive samples.
+            frozen: the readings do not change: nothing is judged.
+
+        Returns:
+            What the model says of them, and the change that was found with them, if it is new.
+        """
+        if batch.broken or not self.companion.running:
+            self.breaks += self.companion.running
+            self.companion.restart()
+            self.detector.restart()
+        residuals = self.companion.step(batch.samples)
+        if not all(np.isfinite(rows).all() for rows in residuals.rows.values()) or not np.isfinite(
+                np.concatenate(residuals.said)).all():
+            self.companion.restart()  # impossible readings have driven a model out of all range
+            self.detector.restart()
+            self.note = "the readings are impossible"
+            return residuals, None
+        self._compare(batch, residuals)
+        if frozen:
+            self.detector.restart()
+            self._stale("the readings do not change: the sensors are frozen")
+            return residuals, None
+        found = None
+        d = self.detector
+        if d.step(residuals, len(batch.stamps) * self.period):
+            self._epoch_ns = int(batch.stamps[-1]) - round(d.time * 1e9)
+            if d.tick % JUDGED == 0:
+                found = d.judge()
+                self.note = "" if d.time > d.settled_at else "settling"
+                self._look()
+        return residuals, found
+
+    def silent(self, why: str) -> None:
+        """Say that no samples come, and why."""
+        self.companion.restart()
+        self.detector.restart()
+        self._stale(why)
+
+    def clear(self) -> None:
+        """Take the rig as it is now."""
+        self.detector.clear()
+        self._look()
+
+    def _stale(self, why: str) -> None:
+        self.note = why
+        for name, place in self.places.items():
+            if place.state != PARTED:
+                self.places[name] = Place(STALE)
+
+    def _compare(self, batch: Batch, residuals: Residuals) -> None:
+        share = 1.0 - math.exp(-len(batch.stamps) * self.period)
+        floors = self.companion.floors
+        for channel in CHANNELS:
+            e = (getattr(batch.samples, channel) - getattr(residuals.said, channel)) / floors[channel]
+            e = e[np.isfinite(e)]
+            if len(e):
+                before = self.free_gap[channel] ** 2
+                self.free_gap[channel] = math.sqrt(before + share * (float(e @ e) / len(e) - before))
+
+    def _look(self) -> None:
+        """Renew the state of each place."""
+        d = self.detector
+        residual = dict.fromkeys(PLACES, 0.0)
+        for channel, gap in zip(CHANNELS, d.gaps, strict=True):
+            residual[PLACE_OF_CHANNEL[channel]] = float(gap)
+        residual["thrust"] = residual["arm"]
+        residual["sensing"] = float(d.gaps.max())
+        drifted = d.drifted(OUT_OF_RANGE)
+        for name in PLACES:
+            here = [f for f in d.findings if f.place == name]
+            seen = d.shows(name)
+            state = NOT_EXCITED if not seen.excited else OK
+            finding = max(here, key=lambda f: f.evidence, default=None)
+            since, effect, probability, size = 0, "", 0.0, math.nan
+            if d.alarm is not None and d.alarm.place == name:
+                state, finding = PARTED, d.alarm
+            elif name in drifted:
+                state = DRIFTED
+                effect, size = drifted[name]
+            if finding is not None and (state == PARTED or finding.evidence > 0.0):
+                effect, probability, size = finding.hypothesis, finding.probability, finding.size
+                since = self.stamp_of(finding.since)
+            self.places[name] = Place(state, seen.gap, seen.limit, residual[name], effect, probability, size, since)
+
+
+SECONDS_PER_JUDGEMENT = JUDGED * TICK
+"""[s] Time between two judgements (derived)."""

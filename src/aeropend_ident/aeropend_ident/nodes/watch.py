@@ -1,0 +1,378 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node that runs the model beside a rig, and says when the two part, where and why.
+
+A thread takes the messages in batches, as `record` does, joins them to samples, and gives them to a `Watcher`. What the
+model says is published with the stamps of the samples, the state of each place on `/diagnostics`. On an alarm it writes
+the minute around it into a bag. Nothing that it publishes moves the rig.
+"""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+from sensor_msgs.msg import BatteryState, JointState
+from std_srvs.srv import Trigger
+from threadpoolctl import threadpool_limits
+
+from aeropend_control.nodes import wire
+from aeropend_ident.live.detector import Finding
+from aeropend_ident.live.intake import Intake
+from aeropend_ident.live.ring import AlarmBag, Message, Ring
+from aeropend_ident.live.watcher import DRIFTED, PARTED, STALE, Place, Watcher
+from aeropend_ident.nodes import said
+from aeropend_ident.nodes.topic_recorder import TopicRecorder, qos_for, qos_of
+from aeropend_sim.errors import UserError
+from aeropend_sim.model.parameters import PRESETS, load
+from aeropend_sim.ros import interface
+from aeropend_sim.ros.diagnostics import CpuShare, Diagnostics
+from aeropend_sim.ros.program import run
+from aeropend_sim.ros.settings import Setting, overrides, read_settings
+from aeropend_sim.ros.usage import usage
+from aeropend_sim.ros.worker import Worker
+
+BATCH_S = 0.05
+"""[s] Time between two batches (choice: half of what a picture may be late)."""
+
+LOOK_S = 0.5
+"""[s] Time between two looks for publishers (choice)."""
+
+SILENT_S = 0.5
+"""[s] Time without a sample after which the rig counts as silent (choice: ten batches)."""
+
+TOPICS = {
+    interface.JOINT_STATES: "sensor_msgs/msg/JointState",
+    interface.ARMATURE: "sensor_msgs/msg/BatteryState",
+    interface.DUTY_COMMAND: "std_msgs/msg/Float64",
+    interface.REFERENCE: "std_msgs/msg/Float64",
+    interface.DIAGNOSTICS: "diagnostic_msgs/msg/DiagnosticArray",
+}
+
+CLEAR = "~/clear"
+"""Service `std_srvs/srv/Trigger`: take the rig as it is now."""
+
+SETTINGS = {
+    "model": Setting("bench", "model of the rig; a model file, for example verdict/augmented.yaml", choices=PRESETS,
+                     path=True),
+    "mean_hours": Setting(24.0, "mean time between two false alarms that is accepted", "h", 0.1, 1e4),
+    "bags": Setting("alarms", "folder for the bag of each alarm; empty: none", path=True),
+    "diagnose": Setting(False, "run diagnose on the bag of each alarm"),
+    "page": Setting(False, "show a page in the browser"),
+    "page_port": Setting(8080, "port of the page", low=1, high=65535),
+    "page_address": Setting("127.0.0.1", "address of the page; anybody who reaches it may look"),
+}
+
+USAGE = usage(
+    "watch: runs the model beside a rig and says when they part, where and why.\nReads joint_states, armature and"
+    " duty_command; publishes model/joint_states, model/armature and /diagnostics. It moves nothing.",
+    SETTINGS,
+    [
+        "watch",
+        "watch --ros-args -p model:=verdict/augmented.yaml",
+        "watch --ros-args -p page:=true",
+        "watch --ros-args -r __ns:=/rig1 -p diagnose:=true",
+    ],
+    "  The service ~/clear takes the rig as it is now, after an alarm.",
+)
+
+LEVEL = {PARTED: DiagnosticStatus.ERROR, DRIFTED: DiagnosticStatus.WARN, STALE: DiagnosticStatus.STALE}
+
+
+class Watch(Node):
+    """The node; see the module's docstring."""
+
+    def __init__(self) -> None:
+        """Prepare.
+
+        Raises:
+            UserError: a parameter or the model file cannot be used.
+        """
+        super().__init__("watch", automatically_declare_parameters_from_overrides=True)
+        given = overrides(self)
+        if any(name.startswith(("model.", "sensing.", "effects.")) for name in given):
+            raise UserError("give the parameters of a model as a file: -p model:=FILE")
+        settings = read_settings(self, SETTINGS, given)
+        self._settings = settings
+        self._watcher = Watcher(load(settings["model"]), settings["mean_hours"])
+        self._intake = Intake()
+        self._ring = Ring()
+        self._bag: AlarmBag | None = None
+        self._children: list[subprocess.Popen[bytes]] = []
+        self._samples = self._malformed = self._alarms = 0
+        self._heard = -math.inf
+        self._crowded = ""
+        self._warned: dict[str, float] = {}
+        self._clear = threading.Event()
+        self._cpu_share = CpuShare()
+        self._lag_ms = 0.0
+
+        qos = interface.QOS
+        self._names = {self.resolve_topic_name(name): name for name in TOPICS}
+        self._recorders = {name: TopicRecorder(name, TOPICS[short]) for name, short in self._names.items()}
+        # no executor serves this node: the thread below reads its subscriptions
+        self._subscriber = Node(f"_{self.get_name()}_subscriptions", namespace=self.get_namespace(),
+                                context=self.context, use_global_arguments=False, enable_rosout=False,
+                                start_parameter_services=False)
+        self._joint_states = self.create_publisher(JointState, interface.MODEL_JOINT_STATES, qos)
+        self._armature = self.create_publisher(BatteryState, interface.MODEL_ARMATURE, qos)
+        self._alarm_publisher = self.create_publisher(DiagnosticArray, interface.DIAGNOSTICS, qos)
+        self.create_service(Trigger, CLEAR, self._on_clear)
+        self._diagnostics = Diagnostics(self, self._report, "model beside the rig", self._statuses)
+        self._page: Any = None
+        if settings["page"]:
+            from aeropend_ident.live.page import Page
+
+            self._page = Page(settings["page_address"], settings["page_port"], settings["model"])
+            self.get_logger().info(f"page: {self._page.url}")
+        self.get_logger().info(f"model {settings['model']}, limit {self._watcher.detector.limit:.1f} for one false"
+                               f" alarm in {settings['mean_hours']:g} h")
+        self._worker = Worker(self, self._run, "watch")
+        self._worker.start()
+
+    def close(self) -> None:
+        """End the thread, the page and the bag."""
+        self._worker.stop()
+        if self._page is not None:
+            self._page.close()
+        if self._bag is not None:
+            self._bag.close()
+        for child in self._children:
+            child.terminate()
+        self._subscriber.destroy_node()
+
+    # ---- the thread ------------------------------------------------------------------------------------------------
+
+    def _run(self, end: threading.Event) -> None:
+        look = 0.0
+        with threadpool_limits(1):
+            self._warm_up()
+            while not end.wait(BATCH_S):
+                now = time.monotonic()
+                if now >= look:
+                    self._look(now)
+                    look = now + LOOK_S
+                for name, recorder in self._recorders.items():
+                    if recorder.subscription is not None:
+                        self._drain(name, recorder)
+                self._judge(now)
+
+    def _warm_up(self) -> None:
+        """Compile before the first sample."""
+        import numpy as np
+
+        from aeropend_ident.live.companion_model import Samples
+
+        zeros = np.zeros(30)
+        self._watcher.companion.step(Samples(zeros, zeros, zeros, zeros, zeros))
+        self._watcher.companion.restart()
+
+    def _look(self, now: float) -> None:
+        """Subscribe to topics that have publishers, with a QoS that all of them are compatible with."""
+        for name, recorder in self._recorders.items():
+            publishers = self.get_publishers_info_by_topic(name)
+            recorder.count_publishers(len(publishers), now)
+            qos = qos_for([info.qos_profile for info in publishers])
+            if recorder.subscription is None or (recorder.publishers and qos != recorder.qos):
+                if recorder.subscription is not None:
+                    self._subscriber.destroy_subscription(recorder.subscription)
+                recorder.qos = qos
+                recorder.subscription = self._subscriber.create_subscription(recorder.message_class, name, _ignore, qos,
+                                                                             raw=True)
+        crowds = [f"{r.publishers} publishers of {self._names[name]}: end all but one" for name, r in
+                  self._recorders.items() if self._names[name] in (interface.JOINT_STATES, interface.ARMATURE)
+                  and r.publishers > 1]
+        self._crowded = crowds[0] if crowds else ""
+        self._children = [child for child in self._children if child.poll() is None]
+
+    def _drain(self, name: str, recorder: TopicRecorder) -> None:
+        short, intake = self._names[name], self._intake
+        while (taken := recorder.take()) is not None:
+            received, data = taken
+            message = Message(received or time.time_ns(), name, data)
+            if self._settings["bags"]:
+                self._ring.add(message)
+                if self._bag is not None:
+                    self._bag.add(message)
+            try:
+                if short == interface.JOINT_STATES:
+                    stamp, position, velocity = wire.joints(data)
+                    intake.joints(stamp, position.get(_ARM, math.nan), velocity.get(_ROTOR, math.nan))
+                elif short == interface.ARMATURE:
+                    intake.armature(*wire.armature(data))
+                elif short == interface.DUTY_COMMAND:
+                    intake.command = wire.read_float64(data)
+                    if self._page is not None:
+                        self._page.command = intake.command
+                elif short == interface.REFERENCE and self._page is not None:
+                    self._page.reference = wire.read_float64(data)
+                elif short == interface.DIAGNOSTICS and self._page is not None:
+                    self._page.hear(data)
+            except wire.MALFORMED:
+                self._malformed += 1
+                self._warn(f"{short}: a message cannot be read, or its stamp is no time: ignored")
+
+    def _judge(self, now: float) -> None:
+        watcher = self._watcher
+        if self._clear.is_set():
+            self._clear.clear()
+            watcher.clear()
+        if self._crowded:
+            self._intake.forget()
+            watcher.silent(self._crowded)
+            self._warn(self._crowded)
+            self._heard = now
+        batches = self._intake.take()
+        for batch in batches:
+            if batch.broken and batch.broken != "start":
+                self._warn(f"{batch.broken}: the model starts anew")
+            residuals, found = watcher.step(batch, frozen=self._intake.frozen)
+            self._publish(batch.stamps.tolist(), residuals.said)
+            self._samples += len(batch.stamps)
+            self._heard = now
+            if self._page is not None:
+                self._page.samples(batch, residuals)
+            if found is not None:
+                self._on_alarm(found)
+        if batches:
+            self._lag_ms = (time.time_ns() - int(batches[-1].stamps[-1])) * 1e-6
+        elif now - self._heard > SILENT_S and watcher.note != _NO_SAMPLES and self._heard > -math.inf:
+            watcher.silent(_NO_SAMPLES)
+            self._intake.forget()
+            self._warn(_NO_SAMPLES)
+        if watcher.note not in ("", "settling", _NO_SAMPLES) and batches:
+            self._warn(watcher.note)
+        if self._bag is not None:
+            self._write_bag()
+        if self._page is not None:
+            self._page.state(self._watcher, self._intake, self._crowded)
+
+    def _publish(self, stamps: list[int], model: Any) -> None:
+        if self._joint_states.get_subscription_count():
+            for stamp, theta, omega in zip(stamps, model.theta.tolist(), model.omega.tolist(), strict=True):
+                self._joint_states.publish(said.joint_states(stamp, theta, omega))
+        if self._armature.get_subscription_count():
+            for stamp, v_a, i_a, duty in zip(stamps, model.v_a.tolist(), model.i_a.tolist(), model.duty.tolist(),
+                                             strict=True):
+                self._armature.publish(said.armature(stamp, v_a, i_a, duty))
+
+    # ---- alarms ----------------------------------------------------------------------------------------------------
+
+    def _on_alarm(self, found: Finding) -> None:
+        self._alarms += 1
+        ago = self._watcher.detector.time - found.since
+        self.get_logger().error(f"model and rig have parted at {found.place}, {ago:.1f} s ago: likeliest "
+                                f"{found.hypothesis} ({found.probability:.0%})")
+        message = DiagnosticArray(status=self._statuses())
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._alarm_publisher.publish(message)
+        if not self._settings["bags"] or self._bag is not None:
+            return
+        path = Path(self._settings["bags"]) / f"{datetime.now():alarm_%Y_%m_%d-%H_%M_%S}"
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._bag = AlarmBag(path, self._ring, {name: TOPICS[short] for name, short in self._names.items()},
+                                 lambda topic: [qos_of(info.qos_profile) for info in
+                                                self.get_publishers_info_by_topic(topic)], time.time_ns())
+        except OSError as error:
+            self.get_logger().error(f"{path}: {error.strerror}: the alarm has no bag")
+
+    def _write_bag(self) -> None:
+        assert self._bag is not None
+        path = self._bag.path
+        try:
+            if not self._bag.write(time.time_ns()):
+                return
+        except OSError as error:
+            self.get_logger().error(f"{path}: {error.strerror}: the bag of the alarm is not whole")
+            self._bag = None
+            return
+        self._bag = None
+        self.get_logger().info(f"the minute around the alarm is in {path}")
+        if self._settings["diagnose"]:
+            self._diagnose(path)
+
+    def _diagnose(self, bag: Path) -> None:
+        out = bag.with_name(f"{bag.name}-verdict")
+        command = ["nice", "-n", "19", sys.executable, "-m", "aeropend_ident.commands.diagnose", str(bag), "--model",
+                   self._settings["model"], "--out", str(out)]
+        self._children.append(subprocess.Popen(command, stdout=subprocess.DEVNULL))
+        self.get_logger().info(f"diagnose runs on it; its report will be {out / 'report.html'}")
+
+    def _on_clear(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        there = self._watcher.alarm is not None
+        self._clear.set()
+        response.success = True
+        response.message = "cleared: the rig as it is now is the new start" if there else "there was no alarm"
+        return response
+
+    # ---- diagnostics -----------------------------------------------------------------------------------------------
+
+    def _warn(self, text: str) -> None:
+        """Log a warning once in ten seconds."""
+        now = time.monotonic()
+        if now > self._warned.get(text, -math.inf) + 10.0:
+            self.get_logger().warn(text)
+            self._warned[text] = now
+
+    def _report(self) -> tuple[str, Mapping[str, object]]:
+        watcher, gap = self._watcher, self._watcher.free_gap
+        alarm = watcher.alarm
+        warnings = [watcher.note if watcher.note != "settling" else ""]
+        if alarm is not None:
+            warnings.append(f"parted at {alarm.place}")
+        values = {
+            "samples": self._samples, "bridged": self._intake.lost, "impossible readings": self._intake.odd,
+            "malformed": self._malformed, "breaks": watcher.breaks, "alarms": self._alarms,
+            "lost": sum(r.lost for r in self._recorders.values()),
+            **{f"free run {channel}": gap[channel] for channel in gap},
+            "statistic": watcher.detector.statistic, "limit": watcher.detector.limit,
+            "lag ms": self._lag_ms, "cpu share": self._cpu_share.since_last(),
+        }
+        return "; ".join(filter(None, warnings)), values
+
+    def _statuses(self) -> list[DiagnosticStatus]:
+        """One status for each place."""
+        name = self.get_fully_qualified_name().lstrip("/")
+        return [_status(f"{name}: {place}", state) for place, state in self._watcher.places.items()]
+
+
+def _status(name: str, place: Place) -> DiagnosticStatus:
+    message = place.state
+    if place.state == PARTED:
+        message = f"model and rig have parted: {place.effect} ({place.probability:.0%})"
+    elif place.state == DRIFTED:
+        message = f"further off than a calibrated rig: {place.effect}"
+    values: dict[str, object] = {
+        "state": place.state, "gap": place.gap, "limit": place.limit, "residual": place.residual,
+        "since": place.since_ns * 1e-9, "effect": place.effect, "probability": place.probability, "size": place.size,
+    }
+    return DiagnosticStatus(level=LEVEL.get(place.state, DiagnosticStatus.OK), name=name, message=message,
+                            hardware_id="model beside the rig",
+                            values=[KeyValue(key=k, value=f"{v:.10g}" if k == "since" else f"{v:.4g}"
+                                             if isinstance(v, float) else str(v)) for k, v in values.items()])
+
+
+_ARM, _ROTOR = interface.JOINTS
+_NO_SAMPLES = "no samples: plant or bridge does not publish"
+
+
+def _ignore(message: bytes) -> None:
+    """A callback that is never called: no executor serves the subscription."""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point of `watch`."""
+    return run(Watch, args, USAGE)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
