@@ -19,13 +19,16 @@ ifneq ($(CURDIR)$(PYTHON),$(shell cat .venv/.tree 2>/dev/null))
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test bench blind real habits sensitivity regression soak coverage lint clean distclean
+.PHONY: help demo live test bench blind real habits sensitivity regression soak coverage lint clean distclean
 
 help: ## show this
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile | expand -t 20
 
 demo: .venv/.runtime ## run a plant with a hidden effect and name it (EFFECT=coulomb_friction pins one, ARGS="--help")
 	$(BIN)/demo $(if $(EFFECT),--effect $(EFFECT)) $(ARGS)
+
+live: .venv/.runtime ## run a plant that changes while it runs, and watch it in the browser (ARGS="--effect cable_torque")
+	$(BIN)/live $(ARGS)
 
 test: .venv/.dev ## build and test with colcon in a temporary folder, then run every test (ARGS="-k plant")
 	tools/setup test

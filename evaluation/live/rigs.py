@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigs in a closed loop whose effect begins at a sealed instant, simulated by the independent plant of the blind check.
+"""Rigs in a closed loop whose effect begins at a sealed instant, simulated by the independent plant.
 
-The loop is one of the controllers of the package or of the blind check, with a reference that jumps. The controller sees
-the readings without the timing of pulses; the recording has all of it.
+The loop is one of the controllers of the package or of the blind check, with a reference that jumps. The controller
+sees the readings without the timing of pulses; the recording has all of it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Law = Callable[[float, Sample], float]
 FLOORS = (2.0, 10.0)
 """Size of an effect, in floors, if it acted all the time."""
 
-QUIET = (30.0, 50.0)
+QUIET = (80.0, 110.0)
 """[s] In which the effect begins."""
 
 AFTER = 25.0
@@ -50,6 +50,9 @@ GROWING = ("supply_drift", "winding_heating")
 BEGINNING = tuple(e for e in EFFECTS if e not in GROWING)
 """Effects that are switched on."""
 
+SHOWN = 20.0
+"""[s] After the begin in which the effect must show to count as excited."""
+
 SIZED_ON = 30.0
 """[s] Duty signal on which an effect is sized."""
 
@@ -59,8 +62,14 @@ class Case:
     """One recording and its label.
 
     Attributes:
-        name: of the case. effect: its id, or "none". place: of the chain. since: [s] when it begins; inf: never.
-        controller: name of the law. floors: size of the effect. parameters: of the effect.
+        name: of the case.
+        effect: its id.
+        place: of the chain.
+        since: [s] when it begins.
+        controller: name of the law.
+        floors: that it would make on the signal on which it was sized.
+        shown: floors that it makes in the loop within `SHOWN` after it has begun.
+        parameters: of the effect.
         samples: of the recording, (N,) each.
     """
 
@@ -70,6 +79,7 @@ class Case:
     since: float
     controller: str
     floors: float
+    shown: float
     parameters: dict[str, float]
     samples: Samples
 
@@ -104,8 +114,12 @@ def closed_loop(p: Array, later: tuple[int, Array] | None, gusts: Array, law: La
     """Integrate the independent plant in a loop.
 
     Args:
-        p: parameters. later: sample from which on other parameters hold, and these.
-        gusts: (N + 2,) random torque, or (0,). law: of the loop. n: samples. sensing: of the readings.
+        p: parameters.
+        later: sample from which on other parameters hold, and these.
+        gusts: (N + 2,) random torque, or (0,).
+        law: of the loop.
+        n: number of samples.
+        sensing: of the readings.
         rng: of the readings that the law sees.
 
     Returns:
@@ -118,7 +132,9 @@ def closed_loop(p: Array, later: tuple[int, Array] | None, gusts: Array, law: La
     noise = rng.standard_normal((n, 3))
     duty = 0.0
     for k in range(n):
-        q, torque = (later[1], gusts) if later is not None and k >= change else (p, gusts if later is None else gusts[:0])
+        begun = later is not None and k >= change
+        q = later[1] if later is not None and begun else p
+        torque = gusts if begun or later is None else gusts[:0]
         applied[k], out[k] = duty, y
         late = round(q[I.command_delay_delay] / PERIOD)
         acting = applied[k - late] if k >= late else 0.0
@@ -175,8 +191,25 @@ def draw(effect: str, controller: str, seed: int, *, imperfect: bool = False) ->
     law = law_of(controller, model, rng, n)
     y, v, applied = closed_loop(without, (change, with_), gusts, law, n, model.sensing, rng)
     columns = measured(without, y, v, model.sensing, rng, (change, with_))
+    shown = shown_in_loop(without, with_, applied, change, gusts)
+    if effect == "speed_spikes":
+        shown = math.inf
     return Case(f"{effect}-{controller}-{seed}", effect, str(entry["place"]), change * PERIOD, controller, floors,
-                dict(own), Samples(columns["theta"], columns["omega"], columns["i_a"], columns["v_a"], applied))  # type: ignore[call-overload]
+                shown, dict(own), Samples(columns["theta"], columns["omega"], columns["i_a"], columns["v_a"], applied))  # type: ignore[call-overload]
+
+
+def shown_in_loop(without: Array, with_: Array, duty: Array, change: int, gusts: Array) -> float:
+    """Floors that an effect makes in a loop: RMS, in the worst channel, over what the same duty gives without it."""
+    begin = max(change - round(10.0 / PERIOD), 0)
+    end = min(change + round(SHOWN / PERIOD), len(duty))
+    part, floor = np.array(duty[begin:end]), sizer(0).floor
+    torque = gusts[begin:end + 2] if len(gusts) else gusts
+    quiet = plant.states(without, part, np.zeros(0))
+    delayed = with_[I.command_delay_delay] > 0.0
+    loud = plant.states(with_, part, torque) if delayed else plant.states(
+        without, part, np.zeros(0) if not len(torque) else torque, later=(change - begin, with_))
+    a, b = plant.shown(without, *quiet[:2]), plant.shown(with_, *loud[:2])
+    return max(float(np.sqrt(np.mean((a[c][change - begin:] - b[c][change - begin:]) ** 2))) / floor[c] for c in a)
 
 
 def measured(p: Array, y: Array, v: Array, sensing: Mapping[str, float], rng: np.random.Generator,

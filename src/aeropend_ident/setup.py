@@ -9,7 +9,8 @@ setup(
     name=PACKAGE,
     version="0.1.0",
     packages=find_packages(exclude=["test", "test.*"]),
-    package_data={"aeropend_ident": ["diagnosis/report/templates/*.j2", "launch/*.yaml", "py.typed"]},
+    package_data={"aeropend_ident": ["diagnosis/report/templates/*.j2", "launch/*.yaml", "live/page/*",
+                                     "py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
@@ -17,7 +18,7 @@ setup(
          [f"{PACKAGE}/launch/{name}.launch.yaml" for name in ("experiment", "hardware", "sim")]),
     ],
     install_requires=["Jinja2", "joblib", "lz4", "numba", "numpy", "openpyxl", "pysindy", "PyYAML", "rich", "rosbags",
-                      "scipy", "threadpoolctl"],
+                      "scipy", "threadpoolctl", "tornado"],
     extras_require={"dask": ["dask", "distributed"], "matlab": ["h5py"],
                     "test": ["h5py", "mcap-ros2-support", "pytest", "pytest-timeout"]},
     python_requires=">=3.10",
@@ -40,6 +41,7 @@ setup(
             "doctor = aeropend_ident.commands.doctor:main",
             "watch = aeropend_ident.nodes.watch:main",
             "demo = aeropend_ident.commands.demo:main",
+            "live = aeropend_ident.commands.live:main",
             "precompile = aeropend_ident.commands.precompile:main",
         ]
     },

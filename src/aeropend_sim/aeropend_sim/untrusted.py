@@ -81,7 +81,7 @@ def load_yaml(text: str | bytes, loader: Any = _FASTEST) -> Any:
 
 
 class NumberLoader(yaml.SafeLoader):
-    """Reads numbers as rcl does (1e-5 is a number, which is text in YAML 1.1), and refuses repeated keys."""
+    """Reads numbers and truth values as rcl does (1e-5 is a number, in YAML 1.1 text), and refuses repeated keys."""
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 - PyYAML's own
 
@@ -100,4 +100,6 @@ NumberLoader.add_implicit_resolver(
     "tag:yaml.org,2002:float",
     re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$"),
     list("-+.0123456789"))
+NumberLoader.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile(r"(true|True|TRUE|false|False|FALSE)$"),
+                                   list("tTfF"))
 NumberLoader.add_implicit_resolver("tag:yaml.org,2002:null", re.compile(r"~$|null$|Null$|NULL$|$"), ["~", "n", "N", ""])

@@ -37,7 +37,9 @@ STARTUP = 30.0
 """s that processes may take to find each other."""
 
 MODULES = {"plant": "aeropend_sim.nodes.plant", "excite": "aeropend_control.nodes.excite",
-           "record": "aeropend_ident.nodes.record", "diagnose": "aeropend_ident.commands.diagnose"}
+           "record": "aeropend_ident.nodes.record", "diagnose": "aeropend_ident.commands.diagnose",
+           "controller": "aeropend_control.nodes.controller", "reference": "aeropend_control.nodes.reference",
+           "watch": "aeropend_ident.nodes.watch"}
 
 
 class DemoError(UserError):
@@ -85,7 +87,8 @@ def process(name: str, *arguments: str, environment: dict[str, str], log: Path) 
                         continue
 
 
-def _check(name: str, child: subprocess.Popen[str], log: Path) -> None:
+def check(name: str, child: subprocess.Popen[str], log: Path) -> None:
+    """Raise a DemoError if a program has ended with an error."""
     if child.poll() not in (None, 0):
         lines = log.read_text(encoding="utf-8").strip().splitlines()
         raise DemoError(f"{name} ended with {child.returncode}: {lines[-1] if lines else 'no output'} (see {log})")
@@ -113,7 +116,7 @@ def measure(folder: Path, rig: Path, duration: float, seed: int, console: Consol
         begun = time.monotonic()
         while record.poll() is None:
             for name, child in running.items():
-                _check(name, child, logs[name])
+                check(name, child, logs[name])
             passed = time.monotonic() - begun
             if passed > duration + STARTUP:
                 raise DemoError(f"the recording did not end {STARTUP:g} s after it should have (see {logs['record']})")
@@ -121,7 +124,7 @@ def measure(folder: Path, rig: Path, duration: float, seed: int, console: Consol
             time.sleep(0.1)
         bar.update(task, completed=duration)
         for name, child in running.items():
-            _check(name, child, logs[name])
+            check(name, child, logs[name])
     return bag
 
 
@@ -171,6 +174,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     truth = ", ".join(f"{k} = {v:.4g}" for p in rig.effects.values() for k, v in p.items())
     hidden = f"{drawn} ({truth})" if truth else drawn
     print(f"hidden in the plant: {hidden}: the verdict is {'right' if right else 'WRONG'}")
+    print("next: make live, a rig that changes while it runs")
     return 0 if right else 1
 
 

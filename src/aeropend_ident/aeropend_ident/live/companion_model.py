@@ -3,8 +3,8 @@
 
 As in the diagnosis (docs/method.md, step 3), but causal, and for a few samples at a time. The motor is driven by the
 voltage read. The arm is driven by the speed of the model plus the error of the last pulses, and follows the angle read
-through an observer, so that it forgets what is past. What the observer has not expected, the innovation, is the residual
-of the arm. Each column of the bank (`bank`) has a model of its own beside the nominal one.
+through an observer, so that it forgets what is past. What the observer has not expected, the innovation, is the
+residual of the arm. Each column of the bank (`bank`) has a model of its own beside the nominal one.
 """
 
 from __future__ import annotations
@@ -110,20 +110,22 @@ class _Members:
         for j in range(len(self.states)):
             self.states[j] = state
 
-    @property
-    def compiled(self) -> Any:
-        """What compiled functions take, in their order."""
-        return self.states, self.c, self.e, self.x, self.chain, self.added
-
 
 @njit(nogil=True)
-def _motor(v: Array, i_a: Array, omega: Array, states: Any, c: Any, e: Any, x: Any, chain: Any, added: Any,  # type: ignore[no-untyped-def]
-           ring: Array, memory: Array, current: Array, pulse: Array, noise_of: Array, speed: Array):
+def _motor(v: Array, i_a: Array, omega: Array, states: Any, c: Any, e: Any, x: Any, chain: Any, added: Any, ring: Array,
+           memory: Array, current: Array, pulse: Array, noise_of: Array, speed: Array) -> tuple[int, int]:
     """Advance the motors of a stage by N samples.
 
     Args:
-        v: (N + 1,) [V] voltage read, the sample before first. i_a, omega: (N,) read.
-        states, c, e, x, chain, added: of `_Members`.
+        v: (N + 1,) [V] voltage read, the sample before first.
+        i_a: (N,) [A] current read.
+        omega: (N,) [rad/s] speed read.
+        states: of `_Members`.
+        c: of `_Members`.
+        e: of `_Members`.
+        x: of `_Members`.
+        chain: of `_Members`.
+        added: of `_Members`.
         ring: (M, TURNS) [rad] angles of the rotors at the last samples.
         memory: samples so far, last speed read, instant of the last pulse [s], is it known, last three errors [rad/s],
             last true interval [s].
@@ -225,8 +227,8 @@ def _turned(ring: Array, j: int, t: float, count: int, h: float) -> float:
 
 
 @njit(nogil=True)
-def _arm(theta: Array, speed: Array, gains: Array, stages: Array, states: Any, c: Any, e: Any, x: Any, chain: Any,  # type: ignore[no-untyped-def]
-         added: Any, out: Array):
+def _arm(theta: Array, speed: Array, gains: Array, stages: Array, states: Any, c: Any, e: Any, x: Any, chain: Any,
+         added: Any, out: Array) -> None:
     """Advance the observers of the arm by N samples.
 
     Args:
@@ -234,7 +236,12 @@ def _arm(theta: Array, speed: Array, gains: Array, stages: Array, states: Any, c
         speed: (N + 1,) [rad/s] speed of the rotor, the sample before first.
         gains: (2,) of the observer: [1], [1/s].
         stages: (M, 2) states of the angle's filter.
-        states, c, e, x, chain, added: of `_Members`.
+        states: of `_Members`.
+        c: of `_Members`.
+        e: of `_Members`.
+        x: of `_Members`.
+        chain: of `_Members`.
+        added: of `_Members`.
         out: (N, M), filled with the innovations [rad].
     """
     n, size = theta.shape[0], out.shape[1]
@@ -367,18 +374,21 @@ class Companion:
 
         size = len(self._motor.states)
         current, pulse, noise_of, speed = np.empty((n, size)), np.empty((n, size)), np.empty(n), np.empty(n)
-        spikes, pulses = _motor(v, samples.i_a, samples.omega, *self._motor.compiled, self._ring, self._memory, current,
-                                pulse, noise_of, speed)
+        m = self._motor
+        spikes, pulses = _motor(v, samples.i_a, samples.omega, m.states, m.c, m.e, m.x, m.chain, m.added, self._ring,
+                                self._memory, current, pulse, noise_of, speed)
         current /= self._noise[1]
         pulse /= noise_of[:, None]
 
         out = np.empty((n, len(self._arm.states)))
-        _arm(samples.theta, np.concatenate([[self._last_speed], speed]), self._gains, self._stages,
-             *self._arm.compiled, out)
+        a = self._arm
+        _arm(samples.theta, np.concatenate([[self._last_speed], speed]), self._gains, self._stages, a.states, a.c, a.e,
+             a.x, a.chain, a.added, out)
         out /= self._noise[3]
 
         said = np.empty((4, n))
-        _free(acting, *self._chain.compiled, self._free_stages, said)
+        f = self._chain
+        _free(acting, f.states, f.c, f.e, f.x, f.chain, f.added, self._free_stages, said)
         self._count += n
         self._last_v, self._last_i, self._last_speed = float(v[-1]), float(i_a[-1]), float(speed[-1])
         rows = {"actuator": _rows((v_rows, 0)), "motor": _rows((current, 1), (pulse, 2)), "arm": _rows((out, 3))}

@@ -32,6 +32,7 @@ from aeropend_ident.diagnosis.chain.values import PLACE_OF_CHANNEL
 from aeropend_ident.diagnosis.search.hypotheses import EFFECT_ODDS
 from aeropend_ident.live.bank import Column
 from aeropend_ident.live.companion_model import CHANNELS, Residuals
+from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
 Array = NDArray[np.float64]
 
@@ -54,16 +55,28 @@ DRIFT = 600.0
 
 Choice: windings warm up and batteries drain in minutes, not in seconds."""
 
-BLOCK = 0.5
-"""[s] Length of the blocks over which the variance of sums is measured (choice: longer than the observer remembers)."""
+BLOCK = 2.0
+"""[s] Length of the blocks over which the variance of sums is measured.
 
-LEARNING = 60.0
-"""[s] Time constant with which the variance of a channel is learned (choice: several references)."""
+Choice: what small imperfections leave lasts as long as the arm stays where it is, about the time between references."""
 
-LEAST_GAP = 0.15
-"""[floors] Lasting gap in a channel that is never material (choice).
+REMEMBERED = 300.0
+"""[s] Time constant with which the variance of a channel is learned (choice: many references)."""
 
-Linearised models of a rig whose numbers are 5 % off leave about so much."""
+EXPECTED_GAP, BELIEVED = 0.5, 5
+"""[floors] Lasting gap that is expected of an unknown rig, and the blocks that it counts for (choice: ten seconds)."""
+
+LEARNS = 60.0
+"""[s] Time of motion after a start in which the rig is learned and no alarm is given (choice: a dozen references)."""
+
+RAISED = 2.0
+"""Multiple of the largest likelihood ratio while the rig was learned by which the limit is raised.
+
+Choice: what a rig has shown once without a change it will show again, and perhaps somewhat larger."""
+
+LEAST_GAP = 0.05
+"""[floors] Lasting gap in a channel that is never material (choice: the linearised model of a rig whose numbers are 5 %
+off leaves about so much)."""
 
 ROBUST = 9.0
 """Largest square of a sum, in variances, that is learned from (convention: three standard deviations)."""
@@ -195,7 +208,9 @@ class _Variance:
     """Variance of the sums of a channel, learned with a delay, and the cumulative sum that tells when it grows."""
 
     def __init__(self) -> None:
-        self.value, self.blocks, self.sum, self.unsure, self.n = 1.0, 0, 0.0, 0.0, 0
+        self.blocks, self.sum, self.unsure, self.n = 0, 0.0, 0.0, 0
+        self.typical = BLOCK / SAMPLE_PERIOD
+        self.value = 1.0 + EXPECTED_GAP**2 * self.typical
         self.waiting: deque[tuple[float, float]] = deque()
         self.cusum, self.since = 0.0, 0.0
 
@@ -203,8 +218,6 @@ class _Variance:
     def weight(self) -> float:
         """Of a row: over the variance of a sum, which is at least that of a gap that is never material."""
         return 1.0 / (self.value + LEAST_GAP**2 * self.typical)
-
-    typical = 245.0
 
     def add(self, left: Array, unsure: float) -> None:
         """Take what is left of some rows, and the variance of their sum that unknown sizes make."""
@@ -216,7 +229,7 @@ class _Variance:
         """End a block."""
         if self.n == 0:
             return
-        self.typical += (self.n - self.typical) / min(self.blocks + 1, 100)
+        self.typical += (self.n - self.typical) / min(self.blocks + 2, 100)
         z, unsure = self.sum * self.sum / self.n, self.unsure**2 / self.n
         expected = self.value + LEAST_GAP**2 * self.n + unsure
         learn = learn and unsure < expected - unsure
@@ -225,11 +238,11 @@ class _Variance:
             self.since = time - BLOCK
         self.cusum = max(0.0, self.cusum + gain)
         self.waiting.append((time, z))
-        while self.waiting and (time - self.waiting[0][0] > WINDOW or self.blocks < 2.0 * WINDOW / BLOCK):
+        while self.waiting and (time - self.waiting[0][0] > WINDOW or self.blocks < LEARNS / BLOCK):
             _, z = self.waiting.popleft()
             if learn:
                 self.blocks += 1
-                share = max(BLOCK / LEARNING, 1.0 / (self.blocks + 1))
+                share = max(BLOCK / REMEMBERED, 1.0 / (self.blocks + BELIEVED))
                 self.value += share * (min(z, ROBUST * max(self.value, 1.0)) - self.value)
                 self.value = max(self.value, 1.0)
         self.sum, self.unsure, self.n = 0.0, 0.0, 0
@@ -244,7 +257,8 @@ class Detector:
     """
 
     def __init__(self, columns: Sequence[Column], limit: float) -> None:
-        self.columns, self.limit = list(columns), limit
+        self.columns, self.least = list(columns), limit
+        self.learned, self.peak = 0.0, 0.0
         self.stages = {b: _Stage([c for c in columns if b in c.stages], TICK) for b in ("actuator", "motor", "arm")}
         self.variance = [_Variance() for _ in CHANNELS]
         self.time = 0.0
@@ -262,6 +276,11 @@ class Detector:
         self._pending_s = 0.0
         self.statistic = 0.0
         self._shown: dict[str, PlaceState] = {}
+
+    @property
+    def limit(self) -> float:
+        """Limit of the likelihood ratios on this rig."""
+        return self.least + RAISED * self.peak
 
     # ---- samples
 
@@ -285,6 +304,8 @@ class Detector:
         self.time += span
         self.tick += 1
         judged = self.time > self.settled_at
+        if judged and moving:
+            self.learned += span
         weights = np.array([v.weight for v in self.variance])
         square, count = np.zeros(len(CHANNELS)), np.zeros(len(CHANNELS))
         for name, stage in self.stages.items():
@@ -322,6 +343,9 @@ class Detector:
         """Look for a change; returns it when it is new."""
         self.findings = self.changes()
         self.statistic = max((f.evidence for f in self.findings), default=0.0)
+        if self.learned < LEARNS:
+            self.peak = max(self.peak, self.statistic)
+            return None
         if self.alarm is None and self.findings and self.statistic > self.limit:
             self._freeze(self.findings[0].since)
             self.findings = self.changes()
@@ -339,7 +363,7 @@ class Detector:
         at = int(np.argmax(information))
         needed = self.limit + 0.5 * math.log1p(information[at] * (c.wide / c.sd) ** 2) - c.log_odds
         least = math.sqrt(2.0 * needed / max(information[at], 1e-12))  # in standard deviations of the size
-        limit = max(least * math.sqrt(mean[at]), 1e-9)
+        limit = max(least * math.sqrt(mean[at]), 1e-9) if information[at] > 1e-9 else math.inf
         gap = abs(float(size[k])) * math.sqrt(mean[k])
         excited = least * c.sd < c.wide / SIZE_SD
         before = shown.get(c.place)

@@ -11,7 +11,7 @@ import numpy as np
 from aeropend_ident.diagnosis.chain.values import PLACE_OF_CHANNEL
 from aeropend_ident.live.bank import columns
 from aeropend_ident.live.companion_model import CHANNELS, Companion, Residuals
-from aeropend_ident.live.detector import TICK, Detector, Finding
+from aeropend_ident.live.detector import LEARNS, TICK, Detector, Finding
 from aeropend_ident.live.false_alarms import limit
 from aeropend_ident.live.intake import Batch
 from aeropend_sim.model.effects import PLACES
@@ -23,6 +23,9 @@ JUDGED = 2
 OUT_OF_RANGE = 3.0
 """Standard deviations of its prior beyond which a number that is tracked is material (convention: as in the
 diagnosis)."""
+
+MOVES, MOVES_S = 0.01, 5.0
+"""Spread of the duty over about so many seconds above which the rig counts as moving (choice: 1 % of its range)."""
 
 OK, NOT_EXCITED, DRIFTED, PARTED, STALE = "ok", "not excited enough to say", "drifted", "parted", "stale"
 """States of a place."""
@@ -76,6 +79,7 @@ class Watcher:
         self.free_gap = dict.fromkeys(CHANNELS, 0.0)
         self.note = "no sample yet"
         self.breaks = 0
+        self._duty = self._spread = 0.0
         self._epoch_ns = 0  # stamp at time 0 of the detector
 
     @property
@@ -115,11 +119,12 @@ class Watcher:
             return residuals, None
         found = None
         d = self.detector
-        if d.step(residuals, len(batch.stamps) * self.period):
+        if d.step(residuals, len(batch.stamps) * self.period, self._moves(batch)):
             self._epoch_ns = int(batch.stamps[-1]) - round(d.time * 1e9)
             if d.tick % JUDGED == 0:
                 found = d.judge()
-                self.note = "" if d.time > d.settled_at else "settling"
+                left = LEARNS - d.learned
+                self.note = f"learning the rig: {left:.0f} s of motion left" if left > 0.0 else ""
                 self._look()
         return residuals, found
 
@@ -139,6 +144,15 @@ class Watcher:
         for name, place in self.places.items():
             if place.state != PARTED:
                 self.places[name] = Place(STALE)
+
+    def _moves(self, batch: Batch) -> bool:
+        """Whether the duty has changed within about the last seconds."""
+        share = 1.0 - math.exp(-len(batch.stamps) * self.period / MOVES_S)
+        duty = batch.samples.duty[np.isfinite(batch.samples.duty)]
+        if len(duty):
+            self._duty += share * (float(duty.mean()) - self._duty)
+            self._spread += share * (float(np.mean((duty - self._duty) ** 2)) - self._spread)
+        return self._spread > MOVES**2
 
     def _compare(self, batch: Batch, residuals: Residuals) -> None:
         share = 1.0 - math.exp(-len(batch.stamps) * self.period)

@@ -20,6 +20,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import BatteryState, JointState
 from std_srvs.srv import Trigger
 from threadpoolctl import threadpool_limits
@@ -42,6 +43,9 @@ from aeropend_sim.ros.worker import Worker
 
 BATCH_S = 0.05
 """[s] Time between two batches (choice: half of what a picture may be late)."""
+
+PICTURE_S = 1.0 / 30.0
+"""[s] The same with a page (choice: 30 pictures a second)."""
 
 LOOK_S = 0.5
 """[s] Time between two looks for publishers (choice)."""
@@ -129,7 +133,7 @@ class Watch(Node):
         self._diagnostics = Diagnostics(self, self._report, "model beside the rig", self._statuses)
         self._page: Any = None
         if settings["page"]:
-            from aeropend_ident.live.page import Page
+            from aeropend_ident.live.server import Page
 
             self._page = Page(settings["page_address"], settings["page_port"], settings["model"])
             self.get_logger().info(f"page: {self._page.url}")
@@ -155,7 +159,7 @@ class Watch(Node):
         look = 0.0
         with threadpool_limits(1):
             self._warm_up()
-            while not end.wait(BATCH_S):
+            while not end.wait(PICTURE_S if self._page else BATCH_S):
                 now = time.monotonic()
                 if now >= look:
                     self._look(now)
@@ -215,10 +219,17 @@ class Watch(Node):
                 elif short == interface.REFERENCE and self._page is not None:
                     self._page.reference = wire.read_float64(data)
                 elif short == interface.DIAGNOSTICS and self._page is not None:
-                    self._page.hear(data)
+                    self._hear(data)
             except wire.MALFORMED:
                 self._malformed += 1
                 self._warn(f"{short}: a message cannot be read, or its stamp is no time: ignored")
+
+    def _hear(self, data: bytes) -> None:
+        """Give the page what other nodes say of themselves."""
+        own = self.get_fully_qualified_name().lstrip("/")
+        for status in deserialize_message(data, DiagnosticArray).status:
+            if not status.name.startswith(own):
+                self._page.heard(status.name, status.level[0], status.message, {v.key: v.value for v in status.values})
 
     def _judge(self, now: float) -> None:
         watcher = self._watcher
@@ -248,12 +259,12 @@ class Watch(Node):
             watcher.silent(_NO_SAMPLES)
             self._intake.forget()
             self._warn(_NO_SAMPLES)
-        if watcher.note not in ("", "settling", _NO_SAMPLES) and batches:
+        if watcher.note not in ("", _NO_SAMPLES) and not watcher.note.startswith("learning") and batches:
             self._warn(watcher.note)
         if self._bag is not None:
             self._write_bag()
         if self._page is not None:
-            self._page.state(self._watcher, self._intake, self._crowded)
+            self._page.state(self._watcher, self._intake, now)
 
     def _publish(self, stamps: list[int], model: Any) -> None:
         if self._joint_states.get_subscription_count():
@@ -326,7 +337,7 @@ class Watch(Node):
     def _report(self) -> tuple[str, Mapping[str, object]]:
         watcher, gap = self._watcher, self._watcher.free_gap
         alarm = watcher.alarm
-        warnings = [watcher.note if watcher.note != "settling" else ""]
+        warnings = ["" if watcher.note.startswith("learning") else watcher.note]
         if alarm is not None:
             warnings.append(f"parted at {alarm.place}")
         values = {
@@ -334,6 +345,7 @@ class Watch(Node):
             "malformed": self._malformed, "breaks": watcher.breaks, "alarms": self._alarms,
             "lost": sum(r.lost for r in self._recorders.values()),
             **{f"free run {channel}": gap[channel] for channel in gap},
+            "learning": watcher.note if watcher.note.startswith("learning") else "done",
             "statistic": watcher.detector.statistic, "limit": watcher.detector.limit,
             "lag ms": self._lag_ms, "cpu share": self._cpu_share.since_last(),
         }

@@ -16,6 +16,7 @@ PURPOSES = {
     "Diagnose the gap between model and rig": {
         "demo": "simulate a rig with a hidden effect, record it and diagnose it",
         "diagnose": "find the effects that a model lacks, from recordings",
+        "live": "simulate a rig that changes while it runs, and watch it",
         "watch": "run the model beside a rig and tell when they part",
         "doctor": "check the installation, recordings and model files",
         "excitation_quality": "check how well an input excites each term of the model",

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The model beside the rig, without ROS: residuals, detection, interruptions."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+from aeropend_ident.live import false_alarms
+from aeropend_ident.live.companion_model import Samples
+from aeropend_ident.live.intake import Batch, Intake
+from aeropend_ident.live.watcher import PARTED, STALE, Watcher
+from aeropend_sim.model.excitation import Excitation
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
+from aeropend_sim.model.rig import Rig
+
+PERIOD_NS = round(SAMPLE_PERIOD * 1e9)
+BEFORE, AFTER = 70.0, 20.0  # s: learned, and watched
+STEP = 25
+
+
+@cache
+def readings(effect: str, parameter: str, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Duty and readings (4, N) of a rig that gets an effect after `BEFORE`, its numbers 3 % off the model's."""
+    bench, rng = load("bench"), np.random.default_rng(5)
+    numbers = {k: x * (1.0 + 0.03 * rng.uniform(-1.0, 1.0)) for k, x in bench.model.items()}
+    duty = Excitation(duration=BEFORE + AFTER, seed=4).series()
+    first = round(BEFORE / SAMPLE_PERIOD)
+    rig = Rig(Model("rig", numbers, bench.sensing, {}), seed=2)
+    before, _ = rig.run(duty[:first])
+    if not effect:
+        return duty, np.hstack([before, rig.run(duty[first:])[0]])
+    other = Rig(Model("rig", numbers, bench.sensing, {effect: {parameter: size}}), seed=3)
+    other._state, other._memory, other._count, other._past = rig._state, rig._memory, rig._count, rig._past
+    return duty, np.hstack([before, other.run(duty[first:])[0]])
+
+
+def watched(duty: np.ndarray, read: np.ndarray) -> tuple[Watcher, list[float]]:
+    """A watcher that has seen it all, and the times of its alarms."""
+    watcher, alarms = Watcher(load("bench")), []
+    for k in range(0, len(duty) - STEP, STEP):
+        s = slice(k, k + STEP)
+        batch = Batch(PERIOD_NS * np.arange(k + 1, k + STEP + 1), Samples(*read[:, s], duty[s]))
+        if watcher.step(batch)[1] is not None:
+            alarms.append(watcher.detector.time)
+    return watcher, alarms
+
+
+def test_a_rig_that_does_not_change_is_no_alarm():
+    watcher, alarms = watched(*readings("", "", 0.0))
+    assert not alarms
+    assert all(place.state not in (PARTED, STALE) for place in watcher.places.values())
+
+
+@pytest.mark.parametrize(("effect", "parameter", "size", "place"), [
+    ("bridge_drop", "v_drop", 0.2, "actuator"), ("rotor_friction", "torque", 5e-4, "rotor"),
+    ("current_offset", "bias", 0.06, "sensing"), ("coulomb_friction", "accel", 0.8, "arm"),
+])
+def test_an_effect_that_begins_is_told_with_instant_place_and_name(effect, parameter, size, place):
+    watcher, alarms = watched(*readings(effect, parameter, size))
+    assert len(alarms) == 1
+    assert 0.0 < alarms[0] - BEFORE < 8.0
+    assert watcher.places[place].state == PARTED
+    assert watcher.alarm.hypothesis == effect
+    assert abs(watcher.stamp_of(watcher.alarm.since) * 1e-9 - BEFORE) < 1.0
+
+
+def test_an_alarm_stays_until_it_is_cleared():
+    watcher, _ = watched(*readings("bridge_drop", "v_drop", 0.2))
+    watcher.silent("nothing comes")
+    assert watcher.places["actuator"].state == PARTED
+    watcher.clear()
+    assert watcher.alarm is None
+    assert watcher.places["actuator"].state != PARTED
+
+
+def test_what_cannot_be_a_reading_is_no_alarm_and_no_crash():
+    duty, read = readings("", "", 0.0)
+    read = read.copy()
+    rng = np.random.default_rng(1)
+    first = round(BEFORE / SAMPLE_PERIOD)
+    bad = first + np.flatnonzero(rng.random(len(duty) - first) < 0.02)
+    read[rng.integers(0, 4, len(bad)), bad] = math.nan
+    _, alarms = watched(duty, read)
+    assert not alarms
+    huge = read.copy()
+    huge[3, first:first + 50] = 1e6
+    assert np.isfinite(watched(duty, huge)[0].detector.statistic)
+
+
+def test_batches_are_cut_where_samples_are_missing_or_the_clock_steps():
+    intake = Intake()
+
+    def give(stamps):
+        for stamp in stamps:
+            intake.joints(stamp, 0.1, 100.0 + stamp % 7)
+            intake.armature(stamp, 0.2 + 1e-3 * (stamp % 11), 0.5, 0.3)
+        return intake.take()
+
+    first = give(PERIOD_NS * np.arange(1, 51))
+    assert [(len(b.stamps), b.broken) for b in first] == [(50, "start")]
+    bridged = give(PERIOD_NS * np.concatenate([np.arange(51, 60), np.arange(65, 70)]))
+    assert [(len(b.stamps), b.broken) for b in bridged] == [(19, "")]
+    assert intake.lost == 5
+    assert np.isnan(bridged[0].samples.theta[9:14]).all()
+    assert (np.diff(bridged[0].stamps) == PERIOD_NS).all()
+    (gap,) = give(PERIOD_NS * np.arange(1000, 1010))
+    assert "without a sample" in gap.broken
+    (back,) = give(PERIOD_NS * np.arange(500, 510))
+    assert "went back" in back.broken
+
+
+def test_halves_are_joined_in_any_order_and_impossible_readings_are_counted():
+    intake = Intake()
+    intake.armature(PERIOD_NS, 0.1, 0.5, math.nan)
+    intake.command = 0.25
+    intake.armature(2 * PERIOD_NS, math.inf, 0.5, math.nan)
+    intake.joints(PERIOD_NS, 0.3, 50.0)
+    intake.joints(2 * PERIOD_NS, 1e9, 50.0)
+    (batch,) = intake.take()
+    assert batch.samples.theta[0] == 0.3
+    assert np.isnan([batch.samples.theta[1], batch.samples.i_a[1]]).all()
+    assert batch.samples.duty[1] == 0.25
+    assert intake.odd == 3
+
+
+def test_readings_that_do_not_change_are_frozen():
+    intake = Intake()
+    for k in range(1, 400):
+        intake.joints(k * PERIOD_NS, 0.1, 100.0)
+        intake.armature(k * PERIOD_NS, 0.2, 0.5, 0.3)
+    intake.take()
+    assert intake.frozen
+    intake.joints(400 * PERIOD_NS, 0.2, 100.0)
+    intake.armature(400 * PERIOD_NS, 0.2, 0.5, 0.3)
+    intake.take()
+    assert not intake.frozen
+
+
+def test_the_limit_follows_from_the_mean_time_between_false_alarms():
+    assert false_alarms.limit(48.0) > false_alarms.limit(24.0)
+    assert false_alarms.mean_hours(false_alarms.limit(24.0)) == pytest.approx(24.0)
