@@ -147,8 +147,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _drive(environment: dict[str, str], folder: Path, running: Mapping[str, tuple[Popen[str], Path]], chance: random.Random,
-           options: argparse.Namespace, page: str) -> None:
+def _drive(environment: dict[str, str], folder: Path, running: Mapping[str, tuple[Popen[str], Path]],
+           chance: random.Random, options: argparse.Namespace, page: str) -> None:
     """Send references until the time is over."""
     begun = time.monotonic()
     opened = options.no_browser

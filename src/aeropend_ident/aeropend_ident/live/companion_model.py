@@ -374,8 +374,8 @@ class Companion:
 
         size = len(self._motor.states)
         current, pulse, noise_of, speed = np.empty((n, size)), np.empty((n, size)), np.empty(n), np.empty(n)
-        m = self._motor
-        spikes, pulses = _motor(v, samples.i_a, samples.omega, m.states, m.c, m.e, m.x, m.chain, m.added, self._ring,
+        o = self._motor
+        spikes, pulses = _motor(v, samples.i_a, samples.omega, o.states, o.c, o.e, o.x, o.chain, o.added, self._ring,
                                 self._memory, current, pulse, noise_of, speed)
         current /= self._noise[1]
         pulse /= noise_of[:, None]

@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from aeropend_ident.diagnosis.chain.priors import SIZE_SD
 from aeropend_ident.diagnosis.chain.values import PLACE_OF_CHANNEL
 from aeropend_ident.diagnosis.search.hypotheses import EFFECT_ODDS
+from aeropend_ident.diagnosis.search.onset import WITHIN
 from aeropend_ident.live.bank import Column
 from aeropend_ident.live.companion_model import CHANNELS, Residuals
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
@@ -63,8 +64,8 @@ Choice: what small imperfections leave lasts as long as the arm stays where it i
 REMEMBERED = 300.0
 """[s] Time constant with which the variance of a channel is learned (choice: many references)."""
 
-EXPECTED_GAP, BELIEVED = 0.5, 5
-"""[floors] Lasting gap that is expected of an unknown rig, and the blocks that it counts for (choice: ten seconds)."""
+EXPECTED_GAP, BELIEVED = 0.25, 3
+"""[floors] Lasting gap that is expected of an unknown rig, and the blocks that it counts for (choice)."""
 
 LEARNS = 60.0
 """[s] Time of motion after a start in which the rig is learned and no alarm is given (choice: a dozen references)."""
@@ -77,6 +78,9 @@ Choice: what a rig has shown once without a change it will show again, and perha
 LEAST_GAP = 0.05
 """[floors] Lasting gap in a channel that is never material (choice: the linearised model of a rig whose numbers are 5 %
 off leaves about so much)."""
+
+NEAR = 3.0
+"""[s] Distance from the instant of an alarm within which all instants are judged with what comes later (choice)."""
 
 ROBUST = 9.0
 """Largest square of a sum, in variances, that is learned from (convention: three standard deviations)."""
@@ -100,7 +104,8 @@ class Finding:
         place: of the chain.
         evidence: log likelihood ratio against no change, with Occam factor and prior odds.
         size: change of the size, SI.
-        since: [s] instant, in the time of the detector.
+        since: [s] instant, in the time of the detector: the middle of those that fit about as well.
+        within: [s] the earliest and the latest of these, a 95 % interval by the profile likelihood.
         gap: [floors] RMS that the change makes in the channels of its stage.
         probability: among all hypotheses on a change.
     """
@@ -111,6 +116,7 @@ class Finding:
     size: float
     since: float
     gap: float
+    within: tuple[float, float]
     probability: float = 0.0
 
 
@@ -381,7 +387,7 @@ class Detector:
         for name, stage in self.stages.items():
             held = list(stage.snapshots)
             last = len(held) - 1 - guard
-            near = [k for k in range(last) if abs(self._time_of(held[k].tick) - since) < 2.0]
+            near = [k for k in range(last) if abs(self._time_of(held[k].tick) - since) < NEAR]
             self._frozen[name] = [(held[k], held[k + guard]) for k in near] or self._pairs(stage)
 
     def _time_of(self, tick: int) -> float:
@@ -421,16 +427,16 @@ class Detector:
                 continue
             total[c.hypothesis] = np.logaddexp(total.get(c.hypothesis, -np.inf), np.logaddexp.reduce(evidence))
             if c.hypothesis not in best or evidence[k] > best[c.hypothesis].evidence:
+                near = [self._time_of(ticks[i]) for i in np.flatnonzero(evidence > evidence[k] - WITHIN)]
                 best[c.hypothesis] = Finding(
-                    c.hypothesis, c.place, float(evidence[k]), float(size[k] * c.sd), self._time_of(ticks[k]),
-                    float(abs(size[k]) * math.sqrt(mean[k])))
+                    c.hypothesis, c.place, float(evidence[k]), float(size[k] * c.sd), 0.5 * (min(near) + max(near)),
+                    float(abs(size[k]) * math.sqrt(mean[k])), (min(near), max(near)))
         self._shown = shown
         for f in self._random():
             best[f.hypothesis], total[f.hypothesis] = f, f.evidence
         top = max(total.values(), default=0.0)
         norm = sum(math.exp(v - top) for v in total.values())
-        found = [Finding(f.hypothesis, f.place, f.evidence, f.size, f.since, f.gap,
-                         math.exp(total[f.hypothesis] - top) / norm) for f in best.values()]
+        found = [replace(f, probability=math.exp(total[f.hypothesis] - top) / norm) for f in best.values()]
         return sorted(found, key=lambda f: -f.evidence)
 
     def shows(self, place: str) -> PlaceState:
@@ -461,11 +467,13 @@ class Detector:
         found = []
         odds = math.log(EFFECT_ODDS)
         if self.spikes > 0.0:
-            found.append(Finding("speed_spikes", "sensing", self.spikes + odds, math.nan, self.spikes_since, 0.0))
+            found.append(Finding("speed_spikes", "sensing", self.spikes + odds, math.nan, self.spikes_since, 0.0,
+                                 (self.spikes_since, self.time)))
         for c, v in zip(CHANNELS, self.variance, strict=True):
             if v.cusum > 0.0:
                 name = "gust" if c == "theta" else f"unknown:{c}"
-                found.append(Finding(name, PLACE_OF_CHANNEL[c], v.cusum + odds, math.nan, v.since, 0.0))
+                found.append(Finding(name, PLACE_OF_CHANNEL[c], v.cusum + odds, math.nan, v.since, 0.0,
+                                     (v.since, self.time)))
         return found
 
     def clear(self) -> None:

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure `watch` without ROS: python -m evaluation.live [--docs].
+
+Each recording is given to the `Watcher` in batches as the node does, much faster than in real time. Rigs whose effect
+begins come from the independent plant; hours without a change from the plant of the package, which is fast enough, and
+with many imperfections from the independent plant. The seeds are not those with which the detector was made.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import pickle
+import sys
+import time
+import tracemalloc
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from threadpoolctl import threadpool_limits
+
+from aeropend_ident.live import false_alarms
+from aeropend_ident.live.companion_model import Samples
+from aeropend_ident.live.intake import Batch
+from aeropend_ident.live.watcher import Watcher
+from aeropend_sim.model.parameters import load
+from evaluation.blind.plant import PERIOD
+from evaluation.live import rigs
+from evaluation.results import put
+
+SEED, CALIBRATION_SEED = 20_000, 700_000
+"""First seeds of what is measured, and of what the limit was calibrated on."""
+
+BATCH = 25
+"""Samples in a batch, as of the node."""
+
+NAMED_WITHIN = 20.0
+"""[s] After the alarm or the begin within which the effect must be named."""
+
+LEVELS = (-4.0, -2.0, 0.0, 2.0, 4.0, 6.0)
+"""Levels whose excursions are counted by the calibration."""
+
+PAGE = Path(__file__).parents[2] / "docs" / "results" / "live.md"
+
+
+@dataclass(frozen=True)
+class Told:
+    """What was told of one recording.
+
+    Attributes:
+        delay: [s] from the begin to the alarm; below 0: a false alarm before; inf: none.
+        onset: [s] instant told minus the true one.
+        within: whether the interval told holds the true instant, within half a second.
+        place: told.
+        effect: told, the most probable at the end.
+        levels: largest likelihood ratio of each ten seconds without a change.
+        load: CPU time over rig time.
+    """
+
+    delay: float
+    onset: float
+    within: bool
+    place: str
+    effect: str
+    levels: list[float]
+    load: float
+
+
+def watched(samples: Samples, since: float, watcher: Watcher | None = None) -> Told:
+    """Give a recording to a watcher."""
+    w = watcher or Watcher(load("bench"))
+    d = w.detector
+    n = len(samples.theta)
+    alarm, levels, highest, block = math.inf, [], -math.inf, 0
+    begun = time.process_time()
+    for k in range(0, n - BATCH + 1, BATCH):
+        s = slice(k, k + BATCH)
+        batch = Batch(np.round(np.arange(k, k + BATCH) * PERIOD * 1e9).astype(np.int64),
+                      Samples(*(x[s] for x in samples)), "start" if k == 0 else "")
+        _, found = w.step(batch)
+        if d.learned > 0.0 and d.alarm is None and d.time < since:
+            highest = max(highest, d.statistic)
+            if int(d.time / 10.0) != block:
+                block = int(d.time / 10.0)
+                levels.append(highest)
+                highest = -math.inf
+        if found is not None and math.isinf(alarm):
+            alarm = d.time
+        if alarm < since:
+            break
+    load_ = (time.process_time() - begun) / max(d.time, 1e-9)
+    if w.alarm is None:
+        return Told(math.inf, math.nan, False, "", "", levels, load_)
+    best = max(d.findings, key=lambda f: f.probability)
+    places: dict[str, float] = {}
+    for f in d.findings:
+        places[f.place] = places.get(f.place, 0.0) + f.probability
+    low, high = w.alarm.within
+    return Told(alarm - since, w.alarm.since - since, low - 0.5 < since < high + 0.5,
+                max(places, key=lambda p: places[p]), best.hypothesis, levels, load_)
+
+
+def cases(count: int, seed: int, keep: Path | None, *, imperfect: bool) -> Iterable[rigs.Case]:
+    """The recordings in which an effect begins, drawn in turn over effects and controllers; kept ones are read."""
+    for k in range(count):
+        rep, i = divmod(k, len(rigs.BEGINNING))
+        name = rigs.CONTROLLERS[(rep * 5 + i * 3 + seed) % len(rigs.CONTROLLERS)]
+        number = seed + 100 * rep + i
+        kept = keep / f"{'m' if imperfect else 'c'}{number}.pkl" if keep else None
+        if kept and kept.exists():
+            yield pickle.loads(kept.read_bytes())
+            continue
+        case = rigs.draw(rigs.BEGINNING[i], name, number, imperfect=imperfect)
+        if kept:
+            kept.write_bytes(pickle.dumps(case))
+        yield case
+
+
+def share(hits: int, of: int) -> str:
+    """A share with its 95 % interval (Wilson)."""
+    if of == 0:
+        return "none"
+    z, p = 1.96, hits / of
+    middle, half = (p + z * z / (2 * of)) / (1 + z * z / of), z / (1 + z * z / of) * math.sqrt(
+        p * (1 - p) / of + z * z / (4 * of * of))
+    return f"{100 * p:.0f} % ({100 * max(middle - half, 0):.0f} to {100 * min(middle + half, 1):.0f}) of {of}"
+
+
+def detection(all_: Sequence[tuple[rigs.Case, Told]]) -> list[tuple[str, str, str]]:
+    """Rows of the table on recordings in which an effect of two floors or more in the loop begins."""
+    shown = [(c, t) for c, t in all_ if c.shown >= rigs.FLOORS[0]]
+    late = np.array([t.delay for _, t in shown])
+    found = [(c, t) for c, t in shown if math.isfinite(t.delay) and t.delay > 0.0]
+    p95 = float(np.sort(np.where(late > 0.0, late, np.inf))[max(math.ceil(0.95 * len(late)) - 1, 0)])
+    median = float(np.median(np.where(late > 0.0, late, np.inf)))
+    return [
+        ("time to the alarm, median", "2 s", f"{median:.2f} s"),
+        ("time to the alarm, 95 %", "8 s", f"{p95:.2f} s"),
+        ("alarm within 8 s", "95 %", share(int(((late > 0.0) & (late < 8.0)).sum()), len(shown))),
+        ("alarm before the begin", "0", share(int((late < 0.0).sum()), len(shown))),
+        ("instant within 0.5 s", "-", share(sum(abs(t.onset) < 0.5 for _, t in found), len(found))),
+        ("the interval of the instant holds it, within 0.5 s", "95 %",
+         share(sum(t.within for _, t in found), len(found))),
+        ("instant, median error", "0.5 s", f"{np.median([abs(t.onset) for _, t in found]):.2f} s"),
+        ("right place", "95 %", share(sum(t.place == c.place for c, t in found), len(found))),
+        ("right effect", "90 %", share(sum(t.effect == c.effect for c, t in found), len(found))),
+        ("of effects that make less than 2 floors in the loop: alarm", "-",
+         share(sum(math.isfinite(t.delay) for c, t in all_ if c.shown < rigs.FLOORS[0]),
+               sum(c.shown < rigs.FLOORS[0] for c, _ in all_))),
+    ]
+
+
+def quiet_hours(hours: float, seed: int, *, messy: bool) -> tuple[int, float, list[float]]:
+    """False alarms, hours, and largest ratios of blocks, over all controllers."""
+    names = rigs.CONTROLLERS
+    length = 600.0 if messy else 1800.0
+    alarms, total, levels = 0, 0.0, []
+    for k in track(range(max(round(hours * 3600.0 / length), 1)), "messy" if messy else "nominal",
+                   console=Console(stderr=True)):
+        name = names[k % len(names)]
+        made = rigs.messy(name, seed + k, length) if messy else rigs.quiet(name, seed + k, length, off=0.05)
+        told = watched(made, math.inf)
+        alarms += math.isfinite(told.delay) or told.delay == -math.inf
+        total += length / 3600.0
+        levels += told.levels
+    return alarms, total, levels
+
+
+def calibrate(hours: float) -> str:
+    """Excursions above some levels per hour, and the line through their logarithms."""
+    _, total, levels = quiet_hours(hours, CALIBRATION_SEED, messy=False)
+    counts = [(level, sum(x > level for x in levels) / total) for level in LEVELS]
+    used = [(a, math.log(r)) for a, r in counts if r > 0.0]
+    slope, at = np.polyfit(*np.array(used).T, 1) if len(used) > 1 else (math.nan, math.nan)
+    lines = [f"{total:.1f} h"] + [f"above {a:g}: {r:.2f} per hour" for a, r in counts]
+    return "\n".join([*lines, f"RATE at 0 = {math.exp(at):.3g} per hour, SLOPE = {-slope:.3g}"])
+
+
+def growth(hours: float) -> float:
+    """MiB by which the memory of Python and numpy grows while a watcher sees hours, after the first half hour."""
+    w = Watcher(load("bench"))
+    samples = rigs.quiet("feedback_linearization", SEED, 1800.0, off=0.03)
+    watched(samples, math.inf, w)
+    tracemalloc.start()
+    first = tracemalloc.get_traced_memory()[0]
+    for _ in range(max(round(2.0 * hours) - 1, 1)):
+        watched(samples, math.inf, w)
+    now = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    return (now - first) / 2**20
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run it; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="evaluation.live", description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=3 * len(rigs.BEGINNING), help="recordings with an effect")
+    parser.add_argument("--messy", type=int, default=len(rigs.BEGINNING), help="the same on messy rigs")
+    parser.add_argument("--hours", type=float, default=24.0, help="hours of nominal rigs without a change")
+    parser.add_argument("--messy-hours", type=float, default=4.0, help="hours of messy rigs without a change")
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--keep", type=Path, help="folder that keeps the recordings")
+    parser.add_argument("--calibrate", action="store_true", help="measure the excursions that `false_alarms` has")
+    parser.add_argument("--each", action="store_true", help="print each recording")
+    parser.add_argument("--docs", action="store_true", help=f"write the table into {PAGE.name}")
+    options = parser.parse_args(arguments)
+    if options.keep:
+        options.keep.mkdir(parents=True, exist_ok=True)
+    with threadpool_limits(1):
+        if options.calibrate:
+            print(calibrate(options.hours))
+            return 0
+        rows: list[tuple[str, str, str, str]] = []
+        for kind, count, imperfect in (("nominal", options.count, False), ("messy", options.messy, True)):
+            all_ = []
+            for case in cases(count, options.seed + 10_000 * imperfect, options.keep, imperfect=imperfect):
+                all_.append((case, watched(case.samples, case.since)))
+                if options.each:
+                    c, t = all_[-1]
+                    print(f"{kind} {c.name}: {c.shown:.1f} floors, after {t.delay:.2f} s, instant {t.onset:+.2f} s, "
+                          f"{t.place}, {t.effect}", flush=True)
+            if all_:
+                rows += [(kind, *row) for row in detection(all_)]
+                rows.append((kind, "CPU of detector and model", "-",
+                             f"{100 * np.median([t.load for _, t in all_]):.1f} % of a core"))
+        for kind, hours, imperfect in (("nominal", options.hours, False), ("messy", options.messy_hours, True)):
+            if hours > 0.0:
+                alarms, total, _ = quiet_hours(hours, options.seed + 100_000, messy=imperfect)
+                rows.append((kind, "false alarms", "1 in 24 h", f"{alarms} in {total:.1f} h"))
+        if options.hours > 0.0:
+            rows.append(("nominal", "growth of memory over 24 h of the rig", "5 MiB",
+                         f"{growth(min(options.hours, 2.0)) * 24.0 / min(options.hours, 2.0):.2f} MiB"))
+    table = ["| rigs | figure | target | measured |", "| --- | --- | --- | --- |"]
+    table += [f"| {' | '.join(row)} |" for row in rows]
+    table += ["", f"Seed {options.seed}; limit {false_alarms.limit(24.0):.1f} for one false alarm in 24 h."]
+    print("\n".join(table))
+    if options.docs:
+        PAGE.write_text(put(PAGE.read_text(encoding="utf-8"), "live-figures", "\n".join(table)), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
