@@ -27,7 +27,7 @@ help: ## show this
 demo: .venv/.runtime ## run a plant with a hidden effect and name it (EFFECT=coulomb_friction pins one, ARGS="--help")
 	$(BIN)/demo $(if $(EFFECT),--effect $(EFFECT)) $(ARGS)
 
-live: .venv/.runtime ## run a plant that changes while it runs, and watch it in the browser (ARGS="--effect cable_torque")
+live: .venv/.runtime ## run a plant that changes and watch it in the browser (ARGS="--effect cable_torque")
 	$(BIN)/live $(ARGS)
 
 test: .venv/.dev ## build and test with colcon in a temporary folder, then run every test (ARGS="-k plant")

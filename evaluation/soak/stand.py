@@ -181,9 +181,11 @@ class Stand:
         elif role == "rig":
             self._rigs.append(self.ear.position())
         args += ["--ros-args"]
+        if role == "watch":
+            args += ["-p", f"bags:={self._folder / 'alarms'}"]
         if role == "rig" and self.rig == "bridge":
             args += ["-p", f"port:={self.board.port}"]
-        self.nodes[role] = self.another(self._names[role], *args)
+        self.nodes[role] = self.another(self._names.get(role, role), *args)
         if role == "recorder":
             self.wait("record records", lambda: sum(
                 file.stat().st_size for file in self._folder.glob(f"{self.bag.name}/*.mcap")) > RECORDING)
@@ -237,11 +239,11 @@ class Stand:
 
     def told(self, role: str, text: str) -> bool:
         """Whether a node's diagnostics have said this since `ear.forget_said`; "" : anything."""
-        return any(text in one for one in self.ear.said.get(self._names[role], ()))
+        return any(text in one for one in self.ear.said.get(self._names.get(role, role), ()))
 
     def counters(self, role: str) -> dict[str, float]:
         """The numeric counters in the last `/diagnostics` of a node."""
-        told = self.ear.counters.get(self._names[role], {})
+        told = self.ear.counters.get(self._names.get(role, role), {})
         return {name: float(value) for name, value in told.items() if value.replace(".", "", 1).isdigit()}
 
     def counted(self, role: str) -> dict[str, float]:

@@ -27,7 +27,7 @@ BLOCKS = 12
 LATE, AS_LATE = 1e-3, 2.0
 """Limits of late samples: their share, and their ratio to the late wake-ups of a program that only sleeps. One of them
 must hold, because on a busy machine every program is late."""
-GROWTH_MIB_H = {"rig": 2.0, "controller": 2.0, "recorder": 10.0, "board": 2.0}
+GROWTH_MIB_H = {"rig": 2.0, "controller": 2.0, "recorder": 10.0, "board": 2.0, "watch": 2.0}
 """MiB/h that may surely be exceeded by none. `record` keeps an index of its bag."""
 
 
@@ -66,11 +66,13 @@ def steady(stand: Stand, seconds: float, show: Callable[[str], None]) -> dict[st
     """Let a stand work, and check what it promises; returns how its processes grow."""
     stand.part = "steady"
     ear = stand.ear
+    stand.start("watch")
     stand.follows()
     bad = ("lost samples", "bad frames", "gaps") if stand.rig == "bridge" else ("lost ticks", "late ticks")
     rig, controller = stand.counted("rig"), stand.counted("controller")
     since, _ = ear.position()
     commands = len(ear.commands)
+    joined = stand.counted("watch")["lost"]
     processes = dict(stand.nodes) | ({"board": stand.board.process} if stand.rig == "bridge" else {})
     times: list[float] = []
     memory: dict[str, list[float]] = {name: [] for name in processes}
@@ -101,6 +103,9 @@ def steady(stand: Stand, seconds: float, show: Callable[[str], None]) -> dict[st
                     f"{name}: none", count <= limit,
                     f"{count:.0f} of {after['samples'] - rig['samples']:.0f}"
                     + (f"; of a program that only sleeps: {slept[name]}" if name in slept else ""))
+    told = stand.counted("watch")
+    stand.check("watch gives no alarm", told["alarms"] == 0.0, f"{told['alarms']:.0f}")
+    stand.check("watch misses no sample", told["lost"] == joined, f"{told['lost'] - joined:.0f}")
     count = stand.counted("controller")["lost"] - controller["lost"]
     stand.check("the controller misses no sample", count == 0.0, f"{count:.0f}")
     short = len(stamps) - commands

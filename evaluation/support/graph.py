@@ -38,6 +38,7 @@ MODULES = {
     "step_test": "aeropend_control.nodes.step_run",
     "record": "aeropend_ident.nodes.record",
     "replay": "aeropend_ident.nodes.replay",
+    "watch": "aeropend_ident.nodes.watch",
     "diagnose": "aeropend_ident.commands.diagnose",
 }
 PATIENCE_S = 60.0

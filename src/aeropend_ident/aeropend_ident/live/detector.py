@@ -13,8 +13,8 @@ Effects of chance change the variance, not the mean. For them there are cumulati
 (CUSUM, E. Page 1954); their mean time between false alarms is at least exp(limit) blocks (G. Lorden: Procedures for
 reacting to a change in distribution. Annals of Mathematical Statistics 42, 1971).
 
-The limit of the likelihood ratios is a matter of the colour of the residuals, which no formula knows; `false_alarms`
-has it as measured on nominal rigs.
+The limit follows from the mean time between false alarms that a person asks for (`false_alarms`). The residuals are
+coloured: each channel is weighted by the variance of its sums over two seconds, which is learned.
 """
 
 from __future__ import annotations
@@ -33,12 +33,10 @@ from aeropend_ident.diagnosis.search.hypotheses import EFFECT_ODDS
 from aeropend_ident.diagnosis.search.onset import WITHIN
 from aeropend_ident.live.bank import Column
 from aeropend_ident.live.companion_model import CHANNELS, Residuals
+from aeropend_ident.live.false_alarms import TICK
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
 Array = NDArray[np.float64]
-
-TICK = 0.1
-"""[s] Time between two instants that are tried (choice: a fifth of what an instant must be told within)."""
 
 WINDOW = 20.0
 """[s] Longest time back for which an instant is tried (choice: the time within which an effect must be named)."""

@@ -11,8 +11,8 @@ import numpy as np
 from aeropend_ident.diagnosis.chain.values import PLACE_OF_CHANNEL
 from aeropend_ident.live.bank import columns
 from aeropend_ident.live.companion_model import CHANNELS, Companion, Residuals
-from aeropend_ident.live.detector import LEARNS, TICK, Detector, Finding
-from aeropend_ident.live.false_alarms import limit
+from aeropend_ident.live.detector import LEARNS, Detector, Finding
+from aeropend_ident.live.false_alarms import TICK, limit
 from aeropend_ident.live.intake import Batch
 from aeropend_sim.model.effects import PLACES
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
