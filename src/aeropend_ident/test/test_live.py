@@ -38,13 +38,19 @@ def readings(effect: str, parameter: str, size: float) -> tuple[np.ndarray, np.n
 
 def watched(duty: np.ndarray, read: np.ndarray) -> tuple[Watcher, list[float]]:
     """A watcher that has seen it all, and the times of its alarms."""
-    watcher, alarms = Watcher(load("bench")), []
+    watcher = Watcher(load("bench"))
+    return watcher, fed(watcher, duty, read)
+
+
+def fed(watcher: Watcher, duty: np.ndarray, read: np.ndarray) -> list[float]:
+    """Times of the alarms of a watcher that sees this."""
+    alarms = []
     for k in range(0, len(duty) - STEP, STEP):
         s = slice(k, k + STEP)
         batch = Batch(PERIOD_NS * np.arange(k + 1, k + STEP + 1), Samples(*read[:, s], duty[s]))
         if watcher.step(batch)[1] is not None:
             alarms.append(watcher.detector.time)
-    return watcher, alarms
+    return alarms
 
 
 def test_a_rig_that_does_not_change_is_no_alarm():
@@ -74,6 +80,9 @@ def test_an_alarm_stays_until_it_is_cleared():
     watcher.clear()
     assert watcher.alarm is None
     assert watcher.places["actuator"].state != PARTED
+    duty, read = readings("bridge_drop", "v_drop", 0.2)
+    last = slice(round((BEFORE + 2.0) / SAMPLE_PERIOD), None)
+    assert not fed(watcher, duty[last], read[:, last])
 
 
 def test_what_cannot_be_a_reading_is_no_alarm_and_no_crash():

@@ -68,6 +68,9 @@ EXPECTED_GAP, BELIEVED = 0.25, 3
 LEARNS = 60.0
 """[s] Time of motion after a start in which the rig is learned and no alarm is given (choice: a dozen references)."""
 
+AGAIN = 15.0
+"""[s] Time of motion in which the rig is learned after an alarm was cleared (choice: some references)."""
+
 RAISED = 2.0
 """Multiple of the largest likelihood ratio while the rig was learned by which the limit is raised.
 
@@ -137,7 +140,7 @@ class PlaceState:
 class _Snapshot:
     """State of a stage at an instant: prior information, and sums since the start."""
 
-    tick: int
+    time: float
     information: Array
     pull: Array
     products: Array
@@ -180,10 +183,10 @@ class _Stage:
         self.rows += len(r)
         return np.asarray(left)
 
-    def snapshot(self, tick: int) -> None:
+    def snapshot(self, time: float) -> None:
         """Remember this instant."""
         information = np.linalg.inv(self.p)
-        self.snapshots.append(_Snapshot(tick, np.asarray(information), information @ self.x, self.products, self.cross,
+        self.snapshots.append(_Snapshot(time, np.asarray(information), information @ self.x, self.products, self.cross,
                                         self.squares, self.rows))
 
     def scores(self, pairs: Sequence[tuple[_Snapshot, _Snapshot]]) -> tuple[Array, Array, Array]:
@@ -325,7 +328,7 @@ class Detector:
                 for c in set(channel.tolist()):
                     total = j[channel == c].sum(axis=0)
                     self.variance[c].add(left[channel == c], max(float(total @ before @ total), 0.0))
-            stage.snapshot(self.tick)
+            stage.snapshot(self.time)
         share = 1.0 - math.exp(-span / 1.0)
         with np.errstate(invalid="ignore", divide="ignore"):
             now = np.where(count > 0, square / np.maximum(count, 1), self.gaps**2)
@@ -385,22 +388,19 @@ class Detector:
         for name, stage in self.stages.items():
             held = list(stage.snapshots)
             last = len(held) - 1 - guard
-            near = [k for k in range(last) if abs(self._time_of(held[k].tick) - since) < NEAR]
+            near = [k for k in range(last) if abs(held[k].time - since) < NEAR]
             self._frozen[name] = [(held[k], held[k + guard]) for k in near] or self._pairs(stage)
-
-    def _time_of(self, tick: int) -> float:
-        return self.time - (self.tick - tick) * TICK
 
     def changes(self) -> list[Finding]:
         """All hypotheses on a change, the likeliest first, each at its likeliest instant."""
         table: dict[tuple[str, tuple[tuple[str, float], ...]], list[tuple[Array, Array, Array]]] = {}
         column_of = {}
-        ticks: list[int] = []
+        times: list[float] = []
         for name, stage in self.stages.items():
             pairs = self._frozen.get(name) or self._pairs(stage)
             if not pairs:
                 return []
-            ticks = [s.tick for s, _ in pairs]
+            times = [s.time for s, _ in pairs]
             score, information, mean = stage.scores(pairs)
             for k, c in enumerate(stage.columns):
                 table.setdefault((c.hypothesis, c.values), []).append((score[:, k], information[:, k], mean[:, k]))
@@ -425,7 +425,7 @@ class Detector:
                 continue
             total[c.hypothesis] = np.logaddexp(total.get(c.hypothesis, -np.inf), np.logaddexp.reduce(evidence))
             if c.hypothesis not in best or evidence[k] > best[c.hypothesis].evidence:
-                near = [self._time_of(ticks[i]) for i in np.flatnonzero(evidence > evidence[k] - WITHIN)]
+                near = [times[i] for i in np.flatnonzero(evidence > evidence[k] - WITHIN)]
                 best[c.hypothesis] = Finding(
                     c.hypothesis, c.place, float(evidence[k]), float(size[k] * c.sd), 0.5 * (min(near) + max(near)),
                     float(abs(size[k]) * math.sqrt(mean[k])), (min(near), max(near)))
@@ -475,11 +475,14 @@ class Detector:
         return found
 
     def clear(self) -> None:
-        """Take the rig as it is now: forget the alarm and the instants, and keep the sizes tracked."""
+        """Take the rig as it is now: forget the alarm and the instants, and learn all sizes anew, whatever they are."""
         self.alarm = None
         self._frozen = {}
+        self.settled_at = self.time + SETTLES
+        self.learned = min(self.learned, LEARNS - AGAIN)
         for stage in self.stages.values():
             stage.reset()
+            stage.p = np.diag([max(c.wide / c.sd, 1.0) ** 2 for c in stage.columns])
         for v in self.variance:
             v.cusum = 0.0
             v.waiting.clear()

@@ -78,7 +78,14 @@ class AlarmBag:
         Raises:
             OSError: the disk is full or failed.
         """
-        for _ in range(min(AT_ONCE, len(self._waiting))):
+        self._write(AT_ONCE)
+        if self._waiting or now_ns < self.end_ns:
+            return False
+        self.close()
+        return True
+
+    def _write(self, most: int) -> None:
+        for _ in range(min(most, len(self._waiting))):
             message = self._waiting.popleft()
             if message.topic not in self._connections:
                 msgtype = self._types[message.topic]
@@ -87,11 +94,12 @@ class AlarmBag:
                     message.topic, msgtype, typestore=self._typestore,
                     offered_qos_profiles=self._offered(message.topic))
             self._writer.write(self._connections[message.topic], message.received, message.data)
-        if self._waiting or now_ns < self.end_ns:
-            return False
-        self.close()
-        return True
 
     def close(self) -> None:
-        """End the bag with what was written."""
+        """Write what waits, and end the bag.
+
+        Raises:
+            OSError: the disk is full or failed.
+        """
+        self._write(len(self._waiting))
         self._writer.close()

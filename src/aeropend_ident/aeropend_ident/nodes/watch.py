@@ -148,7 +148,10 @@ class Watch(Node):
         if self._page is not None:
             self._page.close()
         if self._bag is not None:
-            self._bag.close()
+            try:
+                self._bag.close()
+            except OSError as error:
+                self.get_logger().error(f"{self._bag.path}: {error.strerror}: the bag of the alarm is not whole")
         for child in self._children:
             child.terminate()
         self._subscriber.destroy_node()
