@@ -16,7 +16,7 @@ from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
 from aeropend_sim.model.rig import Rig
 
 PERIOD_NS = round(SAMPLE_PERIOD * 1e9)
-BEFORE, AFTER = 70.0, 20.0  # s: learned, and watched
+BEFORE, AFTER = 74.0, 20.0  # s: learned, and watched; the rotor turns when the effect begins
 STEP = 25
 
 

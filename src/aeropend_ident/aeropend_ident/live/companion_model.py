@@ -128,7 +128,7 @@ def _motor(v: Array, i_a: Array, omega: Array, states: Any, c: Any, e: Any, x: A
         added: of `_Members`.
         ring: (M, TURNS) [rad] angles of the rotors at the last samples.
         memory: samples so far, last speed read, instant of the last pulse [s], is it known, last three errors [rad/s],
-            last true interval [s].
+            was the last speed missing.
         current: (N, M), filled with the residuals of the current [A].
         pulse: (N, M), filled with the residuals of the mean speed [rad/s]; NaN where no pulse came.
         noise_of: (N,), filled with the noise of the mean speed [rad/s].
@@ -160,8 +160,10 @@ def _motor(v: Array, i_a: Array, omega: Array, states: Any, c: Any, e: Any, x: A
             pulse[k, j] = math.nan
         reading, before = omega[k], memory[1]
         noise_of[k] = 1.0
-        if math.isnan(reading):
-            memory[3] = 0.0
+        if math.isnan(reading):  # a pulse may have come that nobody has seen
+            memory[3], memory[7] = 0.0, 1.0
+        elif memory[7] > 0.0:
+            memory[7] = 0.0
         elif step == 0.0:  # a speed that is sampled directly
             for j in range(size):
                 pulse[k, j] = reading - states[j].omega
@@ -202,7 +204,8 @@ def _motor(v: Array, i_a: Array, omega: Array, states: Any, c: Any, e: Any, x: A
             noise_of[k] = 1.0
             memory[4] = memory[5] = memory[6] = pulse[k, 0]
             memory[3] = 0.0
-        memory[1] = reading
+        if not math.isnan(reading):
+            memory[1] = reading
         memory[0] += 1.0
         a, b, d = memory[4], memory[5], memory[6]
         median = max(min(a, b), min(max(a, b), d))
@@ -338,7 +341,7 @@ class Companion:
         self._past = np.full(self._history, duty)
         self._count = 0
         self._last_v = first(s.v_a, float(actuator.voltage(numbers, duty)))
-        self._last_i, self._last_speed = i_a, omega
+        self._last_i, self._last_speed, self._last_off = i_a, omega, 0.0
         self._motor.start(dynamics.State(i_a=i_a, omega=omega))
         self._ring = np.zeros((len(self._motor.states), TURNS))
         self._memory = np.zeros(8)
@@ -370,7 +373,8 @@ class Companion:
             volts.append(sensing.read_voltage(m, actuator.terminal_voltage(m, read, i_a, self.period)))
         self._past = known[-self._history:]
         v_rows = (samples.v_a[:, None] - np.array(volts).T) / self._noise[0]
-        v = np.concatenate([[self._last_v], np.where(np.isfinite(samples.v_a), samples.v_a, volts[0])])
+        off = _held(samples.v_a - volts[0], self._last_off)
+        v = np.concatenate([[self._last_v], volts[0] + off])
 
         size = len(self._motor.states)
         current, pulse, noise_of, speed = np.empty((n, size)), np.empty((n, size)), np.empty(n), np.empty(n)
@@ -390,6 +394,7 @@ class Companion:
         f = self._chain
         _free(acting, f.states, f.c, f.e, f.x, f.chain, f.added, self._free_stages, said)
         self._count += n
+        self._last_off = float(off[-1])
         self._last_v, self._last_i, self._last_speed = float(v[-1]), float(i_a[-1]), float(speed[-1])
         rows = {"actuator": _rows((v_rows, 0)), "motor": _rows((current, 1), (pulse, 2)), "arm": _rows((out, 3))}
         return Residuals({k: r[0] for k, r in rows.items()}, {k: r[1] for k, r in rows.items()},

@@ -80,6 +80,9 @@ LEAST_GAP = 0.05
 """[floors] Lasting gap in a channel that is never material (choice: the linearised model of a rig whose numbers are 5 %
 off leaves about so much)."""
 
+INEXACT = 0.01
+"""Share of the evidence by which two instants may differ and fit as well (choice: the columns are linearised)."""
+
 NEAR = 3.0
 """[s] Distance from the instant of an alarm within which all instants are judged with what comes later (choice)."""
 
@@ -354,7 +357,7 @@ class Detector:
             self.peak = max(self.peak, self.statistic)
             return None
         if self.alarm is None and self.findings and self.statistic > self.limit:
-            self._freeze(self.findings[0].since)
+            self._freeze(*self.findings[0].within)
             self.findings = self.changes()
             self.alarm, self.alarm_at = self.findings[0], self.time
             return self.alarm
@@ -382,13 +385,13 @@ class Detector:
         oldest = len(held) - 1
         return [(held[oldest - a], held[oldest - a + guard]) for a in self.ages if a <= oldest]
 
-    def _freeze(self, since: float) -> None:
-        """Keep the instants around one, so that it can be judged with what comes later."""
+    def _freeze(self, low: float, high: float) -> None:
+        """Keep the instants from one to another and near them, so that they can be judged with what comes later."""
         guard = round(GUARD / TICK)
         for name, stage in self.stages.items():
             held = list(stage.snapshots)
             last = len(held) - 1 - guard
-            near = [k for k in range(last) if abs(held[k].time - since) < NEAR]
+            near = [k for k in range(last) if low - NEAR < held[k].time < high + NEAR]
             self._frozen[name] = [(held[k], held[k + guard]) for k in near] or self._pairs(stage)
 
     def changes(self) -> list[Finding]:
@@ -425,7 +428,8 @@ class Detector:
                 continue
             total[c.hypothesis] = np.logaddexp(total.get(c.hypothesis, -np.inf), np.logaddexp.reduce(evidence))
             if c.hypothesis not in best or evidence[k] > best[c.hypothesis].evidence:
-                near = [times[i] for i in np.flatnonzero(evidence > evidence[k] - WITHIN)]
+                near = [times[i] for i in np.flatnonzero(
+                    evidence > evidence[k] - WITHIN - INEXACT * abs(evidence[k]))]
                 best[c.hypothesis] = Finding(
                     c.hypothesis, c.place, float(evidence[k]), float(size[k] * c.sd), 0.5 * (min(near) + max(near)),
                     float(abs(size[k]) * math.sqrt(mean[k])), (min(near), max(near)))

@@ -4,9 +4,9 @@
 The evidence of a change is the logarithm of a Bayes factor times its prior odds. Without a change a Bayes factor has
 the mean 1. So the sum over all instants and hypotheses, a statistic of Shiryaev and Roberts, grows on average by the
 sum of the prior odds with each instant that is tried, and the mean time until the largest of its terms passes
-exp(limit) is at least exp(limit) over that growth (M. Pollak: Optimal detection of a change in distribution. Annals of Statistics 13,
-1985; the same bound as in G. Lorden 1971). This holds for residuals whose noise is as the detector takes it; how far it
-holds for simulated rigs is measured (docs/results/live.md).
+exp(limit) is at least exp(limit) over that growth (M. Pollak: Optimal detection of a change in distribution. Annals of
+Statistics 13, 1985; the same bound as in G. Lorden 1971). This holds for residuals whose noise is as the detector takes
+it; how far it holds for simulated rigs is measured (docs/results/live.md).
 """
 
 from __future__ import annotations
