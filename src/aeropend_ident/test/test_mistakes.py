@@ -122,9 +122,9 @@ def test_a_motor_that_runs_while_the_duty_stays_at_0_is_refused(columns):
     assert mistakes.found(c, still, SAMPLE_PERIOD, BENCH) == []
 
 
-def test_a_duty_that_is_inverted_is_refused_although_no_command_mends_it(columns):
+def test_a_duty_that_is_inverted_is_refused(columns):
     (one,) = mistakes.found(columns, 1.0 - columns["duty"], SAMPLE_PERIOD, BENCH)
-    assert (one.sure, one.options) == (True, ())
+    assert (one.sure, one.options) == (True, ("--duty duty:counts:1..0",))
     assert "inverted (the rig follows 1 - duty)" in one.what
 
 
@@ -150,12 +150,12 @@ def test_a_rotor_that_runs_up_under_the_duty_of_the_first_sample_is_no_mistake()
 
 
 @pytest.mark.parametrize("missing", [(), ("v_a",)])
-def test_a_duty_that_is_stamped_late_is_a_note(missing):
+def test_a_voltage_before_its_duty_is_refused_and_a_speed_is_a_note(missing):
     c = drawn(31, duration=20.0)
     late = np.concatenate([np.zeros(245), c["duty"][:-245]])
     (one,) = mistakes.found(c | {name: np.full(len(late), np.nan) for name in missing}, late, SAMPLE_PERIOD, BENCH)
-    assert not one.sure
-    assert re.search(r"best if that was 0\.(48|49|50|51|52) s earlier", one.what)
+    assert one.sure == (not missing)
+    assert re.search(r"stamped 0\.(48|49|50|51|52) s late", one.what)
 
 
 @pytest.mark.parametrize("effect", [None, "speed_spikes", "encoder_lag", "command_delay", "angle_offset"])

@@ -101,7 +101,7 @@ def contents(path: str, read: Recording, likely: Sequence[Mistake] = ()) -> Iter
 
 def _samples(path: str, read: Recording) -> Iterator[Check]:
     """Length and lost samples."""
-    if read.duration < SHORT:
+    if read.duration < SHORT - 0.5:  # as the number that is printed is rounded
         yield warning(path, f"only {read.duration:.0f} s long: record {SHORT:.0f} s or more")
     share = read.lost / max(read.lost + len(read), 1)
     if share > FEW_LOST:

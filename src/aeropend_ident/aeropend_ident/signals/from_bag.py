@@ -69,6 +69,9 @@ MOST_PLACES = 500
 AS_LONG = 1.2
 """Ratio by which the span of stamps may miss that of the receive times (choice: a recorder may begin late)."""
 
+FASTEST_RATE = 20e3
+"""[1/s] Samples in a second above which stamps are in another unit (choice: far above what a board of a rig sends)."""
+
 BACKWARDS = 0.02
 """Voltage of the other sign, over the largest, that is no drive in both directions (choice: an offset)."""
 
@@ -167,19 +170,23 @@ def no_angle(read: Recording) -> str:
 
 
 def check_stamps(read: Recording) -> None:
-    """Refuse a recording whose stamps are in a smaller unit, by the times at which it was received.
+    """Refuse a recording whose stamps are in a smaller unit, by the times at which it was received, or by its rate.
 
     Raises:
         RecordingError: they are; one line with the command that mends it.
     """
     received = float(np.ptp(read.received_ns)) * 1e-9
-    if not 0.0 < read.duration < MINIMUM_DURATION <= received:
+    if not 0.0 < read.duration < MINIMUM_DURATION:
         return
-    power = round(math.log10(received / read.duration) / 3.0)
+    power = round(math.log10(received / read.duration) / 3.0) if received >= MINIMUM_DURATION else 0
     if power >= 1 and 1.0 / AS_LONG < received / read.duration / 1000.0**power < AS_LONG:
         raise RecordingError(f"{read.path}: its stamps span {read.duration:.3g} s, but it was received over "
                              f"{received:.3g} s: if the stamps are in another unit, "
                              f"{named(mend(f'--time t:{1000**power}s'), read.path)} mends it")
+    if (rate := len(read) / read.duration) > FASTEST_RATE:
+        unit = f"{1000 ** math.ceil(math.log10(rate / FASTEST_RATE) / 3.0)}s"
+        raise RecordingError(f"{read.path}: {len(read)} samples in {read.duration:.3g} s, {rate:.3g} a second: if the "
+                             f"stamps are in another unit, {named(mend(f'--time t:{unit}'), read.path)} mends it")
 
 
 def likely_mistakes(read: Recording, model: Model, mounting: Mounting | None = None) -> list[Mistake]:

@@ -88,7 +88,7 @@ STILL = 0.01
 
 LATE = {"v_a": 0.1, "omega": 0.3}
 """[s] Least time by which a reading is ahead of its simulation where the duty is late, by channel (choice: a rotor of
-another inertia is ahead too).
+another inertia is ahead too; a voltage never is).
 
 Measured: of 72 rigs, healthy ones and one of each effect and seed, none is called late."""
 
@@ -276,7 +276,7 @@ def _turned_duty(readings: Mapping[str, Array], duty: Array, period: float, mode
         return None
     for other, what, options in (
             (-duty, "turned over (the rig follows it with the other sign)", ("--duty duty:-100%",)),
-            (1.0 - duty, "inverted (the rig follows 1 - duty): publish 1 - duty, or record again", ())):
+            (1.0 - duty, "inverted (the rig follows 1 - duty)", ("--duty duty:counts:1..0",))):
         if np.abs(other).max() <= 1.0 and _largest_error(
                 readings, record(model, other, period=period)[0]) < min(FITS, own / BETTER):
             return Mistake(f"it looks as if the duty is {what}", sure=True, options=options)
@@ -350,9 +350,9 @@ def _late(readings: Mapping[str, Array], simulated: Mapping[str, Array], period:
         best = min(left, key=lambda k: left[k])
         lead = best * every * period
         if lead >= least and left[best] < LATE_LEFT and left[best] < left[0] / LATE_BETTER:
-            return Mistake(f"the {NAMES[name]} follows the duty best if that was {lead:.2f} s earlier, and no effect "
-                           "is ahead of its duty: if the duty is stamped late, stamp it with the instant from which it "
-                           "acts, and record again", sure=False)
+            return Mistake(f"it looks as if the duty were stamped {lead:.2f} s late: the {NAMES[name]} changes before "
+                           "it, as with no effect; stamp it with the instant from which it acts, and record again",
+                           sure=name == "v_a")
         return None
     return None
 
@@ -411,15 +411,15 @@ def _of_channel(name: str, x: Array, y: Array, *, same_rig: bool) -> Mistake | N
     size = 1.0 if unit is None else unit.ratio
     zero = float(np.median(y - (-size if turned else size) * x))
     off = name == "theta" and 1.0 / CLOSE < ratio / size < CLOSE and abs(zero) > OFF_ZERO * size
-    hangs = f"{zero:.2f}rad" if unit is None else f"{zero:.3g}{unit.name}"
+    hangs = f"{zero:.3f}rad" if unit is None else f"{zero:.3g}{unit.name}"
     options = (f"--zero {hangs}",) if off else ()
     if unit is not None:
         what = f"is in {unit.name}{' and turned over' * turned}"
     elif turned and 1.0 / OPPOSITE < ratio < OPPOSITE:
         what = "is turned over"
     elif off and not turned:
-        return Mistake(f"it looks as if the arm hung at a reading of {zero:.2f} rad, not 0 (check that it does)",
-                       abs(zero) > ZERO, options)
+        return Mistake(f"it looks as if the arm hung at a reading of about {zero:.3f} rad, not 0 (let it hang, and "
+                       "give what is read then)", abs(zero) > ZERO, options)
     else:
         return None
     if name == "theta":

@@ -217,9 +217,11 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
     """
     n = len(columns["duty"])
     if n * period < MINIMUM_DURATION:
-        raise RecordingError(f"{name}: {n * period:.1f} s of samples; a diagnosis needs {MINIMUM_DURATION:g} s or more")
+        raise RecordingError(f"{name}: {n} samples in {n * period:.3g} s; a diagnosis needs {MINIMUM_DURATION:g} s or "
+                             "more")
     if not np.isfinite(columns["theta"]).any():
         raise RecordingError(f"{name}: no arm angle was measured (joint_states, position of 'arm'); nothing to compare")
+    _check_turns(columns["theta"], name)
     if not np.isfinite(columns["duty"]).any():
         raise RecordingError(f"{name}: no duty was recorded (armature.percentage or duty_command); "
                              "without it the model has no input; record one of them too, or use --uncalibrated if the "
@@ -238,9 +240,7 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
         if n > train and np.isfinite(columns["theta"][part]).sum() < FEWEST:
             raise RecordingError(f"{name}: the arm angle was not read in the part that is {where}: it is missing, "
                                  "stuck or at the end of its range; record again, or cut that part off")
-    if np.ptp(columns["theta"][np.isfinite(columns["theta"])]) == 0.0:
-        raise RecordingError(f"{name}: the arm angle stays the same all the time: the sensor or the arm is stuck, "
-                             "so no verdict is possible")
+    _check_turns(columns["theta"], name)
     if period > 1.25 * SAMPLE_PERIOD:  # the duty may have stepped between two samples
         steps = np.flatnonzero(np.abs(np.diff(duty)) > STILL) + 1
         near = steps[:, None] + np.arange(math.ceil(SETTLED / period) + 1)
@@ -323,6 +323,13 @@ def _noise(columns: Mapping[str, Array], duty: Array, sensing: Mapping[str, floa
         stated = math.hypot(sensing[f"{key}_noise"], quantised)
         sigma[channel] = stated if seen is None else max(seen, quantised, least_noise(x))
     return sigma
+
+
+def _check_turns(theta: Array, name: str) -> None:
+    known = theta[np.isfinite(theta)]
+    if len(known) >= FEWEST and np.ptp(known) == 0.0:
+        raise RecordingError(f"{name}: the arm angle is {known[0]:.3g} rad in all readings: the sensor is stuck or "
+                             "unplugged, or the arm is held; check it, and record again")
 
 
 def _leave_out_stuck(columns: dict[str, Array], duty: Array, train: int) -> list[str]:
