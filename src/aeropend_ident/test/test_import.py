@@ -256,3 +256,12 @@ def test_a_recording_is_imported_only_to_change_something(recorded, capsys):
     for words in ([recorded], [recorded, recorded.with_name("new")]):
         assert "is a recording already: name what to change" in refused(capsys, *words)
     assert not recorded.with_name("new").exists()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_table_with_numbers_that_can_be_no_reading_is_shown(tmp_path, capsys):
+    odd = np.where(np.arange(len(TIME)) % 3 > 0, 1.7e308, ANGLE)
+    assert main([str(put(tmp_path, lines(TIME, ANGLE, odd, form="{:.4g}")))]) == 2
+    shown = capsys.readouterr()
+    assert "1.7e+308" in shown.out
+    assert len(shown.err.splitlines()) == 1

@@ -291,11 +291,12 @@ def propose(table: Table, found: Sequence[Guess], chosen: dict[str, str], given:
     encoding = getattr(sys.stdout, "encoding", None)
     for heading in ("column", "first values", "range", "", "looks like"):
         shown.add_column(heading, overflow="fold")
+    drawn = table.possible().columns
     for k, (column, one) in enumerate(zip(table.columns, found)):
         x = column.values[np.isfinite(column.values)]
         low_high = f"{x.min():.6g} to {x.max():.6g}" if len(x) and not column.is_clock else ""
         what = f"{one.quantity}{'' if one.sure else '?'} ({one.why})" if one.quantity else one.why or "?"
-        cells = (table.label(k), "  ".join(column.shown), low_high, sparkline(column.values, encoding), what)
+        cells = (table.label(k), "  ".join(column.shown), low_high, sparkline(drawn[k].values, encoding), what)
         shown.add_row(*(escape(printable(cell)) for cell in cells))
     print(printable(f"{table.path}: {counted(len(table), 'row')}"))
     for note in table.notes:
