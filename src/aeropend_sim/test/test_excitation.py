@@ -100,6 +100,9 @@ def test_the_default_signal_moves_the_bench_rig_widely_and_safely(seed):
     [
         ({"kind": "sweep"}, "latin_hypercube"),
         ({"duration": 0.0}, "duration"),
+        ({"duration": 1e12}, "duration .* at most 3600"),
+        ({"kind": "free_decay", "rest": float("inf")}, "rest is inf: give a number"),
+        ({"hold_max": float("nan")}, "hold_max is nan: give a number"),
         ({"duty_min": 0.5, "duty_max": 0.4}, "duty_min"),
         ({"duty_max": 1.1}, "duty_max"),
         ({"hold_min": 3.0}, "hold_max"),

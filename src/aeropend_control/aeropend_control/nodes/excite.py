@@ -22,7 +22,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from std_msgs.msg import Float64
 
 from aeropend_sim.errors import UserError
-from aeropend_sim.model.excitation import KINDS, Excitation
+from aeropend_sim.model.excitation import KINDS, LONGEST, Excitation
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 from aeropend_sim.ros import interface
 from aeropend_sim.ros.diagnostics import Diagnostics
@@ -40,7 +40,7 @@ NEWS_S = 5.0
 _DEFAULT = Excitation()
 SETTINGS = {
     "kind": Setting(_DEFAULT.kind, "the signal", choices=tuple(KINDS)),
-    "duration": Setting(_DEFAULT.duration, "length of the signal", "s", 0.01, 3600.0),
+    "duration": Setting(_DEFAULT.duration, "length of the signal", "s", 0.01, LONGEST),
     "seed": Setting(_DEFAULT.seed, "the same seed gives the same signal", low=0, high=2**31 - 1),
     "duty_min": Setting(_DEFAULT.duty_min, "least duty of latin_hypercube, staircase, multisine", low=-1.0, high=1.0),
     "duty_max": Setting(_DEFAULT.duty_max, "greatest duty of the same", low=-1.0, high=1.0),

@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ from aeropend_sim.errors import UserError
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
 Array = NDArray[np.float64]
+
+LONGEST = 3600.0
+"""[s] Longest signal (choice; it bounds the memory)."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +54,13 @@ class Excitation:
 
     def __post_init__(self) -> None:
         nyquist = 0.5 / SAMPLE_PERIOD
+        numbers = [(f.name, x) for f in fields(self) if isinstance(x := getattr(self, f.name), float)]
+        odd = [(name, x) for name, x in numbers if not math.isfinite(x)]
         for wrong, message in (
+            (bool(odd), "; ".join(f"{name} is {x:g}: give a number" for name, x in odd)),
             (self.kind not in KINDS, f"kind is '{self.kind}': give one of {', '.join(KINDS)}"),
             (self.duration < SAMPLE_PERIOD, f"duration is {self.duration:g} s: give at least one sample, 0.00204 s"),
+            (self.duration > LONGEST, f"duration is {self.duration:g} s: give at most {LONGEST:g}"),
             (
                 not -1.0 <= self.duty_min < self.duty_max <= 1.0,
                 f"duty_min {self.duty_min:g} and duty_max {self.duty_max:g}: give -1 <= duty_min < duty_max <= 1",
