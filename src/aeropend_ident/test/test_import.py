@@ -265,3 +265,9 @@ def test_a_table_with_numbers_that_can_be_no_reading_is_shown(tmp_path, capsys):
     shown = capsys.readouterr()
     assert "1.7e+308" in shown.out
     assert len(shown.err.splitlines()) == 1
+
+
+def test_a_time_whose_rows_fall_together_is_refused(tmp_path, capsys):
+    path = put(tmp_path, lines(1e-3 * TIME, ANGLE, form="{:.6f}"))
+    said = refused(capsys, path, tmp_path / "bag", "--time", "1:ns", "--theta", "2:deg")
+    assert "less than 1 ns from row to row: is the unit of the time right?" in said

@@ -176,6 +176,10 @@ def samples(table: Table, plan: Plan) -> Samples:
         notes.append(f"time begins at {first:g} s: shifted to begin at 0")
     start = max(round(first * 1e9), 0)
     stamps = start + np.rint((dated.time - first) * 1e9).astype(np.int64)
+    if not (np.diff(stamps) > 0).all():
+        raise TableError(f"{table.path}: its time spans {float(np.ptp(dated.time)):.3g} s over "
+                         f"{counted(len(stamps), 'row')}, less than 1 ns from row to row: is the unit of the time "
+                         "right?")
     used = {k for k, _ in chosen.values()}
     return Samples(
         stamp_ns=stamps, channels=channels, reference=reference, rows=dated.measured, period=dated.period,
