@@ -271,3 +271,9 @@ def test_a_time_whose_rows_fall_together_is_refused(tmp_path, capsys):
     path = put(tmp_path, lines(1e-3 * TIME, ANGLE, form="{:.6f}"))
     said = refused(capsys, path, tmp_path / "bag", "--time", "1:ns", "--theta", "2:deg")
     assert "less than 1 ns from row to row: is the unit of the time right?" in said
+
+
+def test_a_column_without_numbers_is_named_where_each_cell_can_be_read(tmp_path, capsys):
+    path = put(tmp_path, "t;theta;omega\n0,000;0,100;NaN\n")
+    said = refused(capsys, path, tmp_path / "bag", "--time", "1:s", "--theta", "2:rad", "--omega", "3:rad/s")
+    assert "column 3 (omega) holds hardly any number" in said

@@ -447,8 +447,12 @@ class _Reading:
             values: Floats = np.frombuffer(store.values, dtype=np.float64) if store.values else np.empty(0)
             values = np.where(np.isfinite(values), values, np.nan)
             bad = np.arange(len(values)) if self.dialect.texts[k] else np.array(store.bad, dtype=np.int64)
-            column = Column(self.dialect.names[k], values, self.dialect.units[k], self.dialect.clocks[k],
-                            tuple(store.shown), bad, store.complaint)
+            name, complaint = self.dialect.names[k], store.complaint
+            if len(bad) and not complaint:  # each cell can be read: as nothing, or some as numbers, some as times of day
+                which = f"{k + 1} ({name})" if name else f"{k + 1}"
+                complaint = f"{self.path}: column {which} holds hardly any number, or numbers and times of day"
+            column = Column(name, values, self.dialect.units[k], self.dialect.clocks[k], tuple(store.shown), bad,
+                            complaint)
             columns.append(column)
         while len(columns) > 1 and not columns[-1].shown and not columns[-1].name:
             columns.pop()  # a delimiter at the end of each line
