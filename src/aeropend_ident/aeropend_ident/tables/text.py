@@ -448,7 +448,7 @@ class _Reading:
             values = np.where(np.isfinite(values), values, np.nan)
             bad = np.arange(len(values)) if self.dialect.texts[k] else np.array(store.bad, dtype=np.int64)
             name, complaint = self.dialect.names[k], store.complaint
-            if len(bad) and not complaint:  # each cell can be read: as nothing, or some as numbers, some as times of day
+            if len(bad) and not complaint:  # each cell can be read: as nothing, a number or a time of day
                 which = f"{k + 1} ({name})" if name else f"{k + 1}"
                 complaint = f"{self.path}: column {which} holds hardly any number, or numbers and times of day"
             column = Column(name, values, self.dialect.units[k], self.dialect.clocks[k], tuple(store.shown), bad,
