@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from aeropend_ident.estimation.map_fit import LARGEST, Sensitivities, finite, fit, screen, whittle
+from aeropend_ident.estimation.map_fit import LARGEST, Sensitivities, covariance_of, finite, fit, screen, whittle
 from aeropend_ident.estimation.parameter import Parameter
 from aeropend_ident.signals.statistics import effective_sample_size
 
@@ -156,3 +156,12 @@ def test_residuals_of_a_simulation_that_diverges_stay_numbers():
     assert finite(np.array([1.0, np.nan, -np.inf, 1e300])).tolist() == [1.0, LARGEST, -LARGEST, LARGEST]
     assert finite(np.array([[1.0, 1e40]]), 1e30).tolist() == [[1.0, 1e30]]
     assert finite(np.zeros((0, 3))).shape == (0, 3)
+
+
+def test_a_covariance_has_variances_above_0_however_near_to_singular_its_information_is():
+    good = np.array([[4.0, 1.0], [1.0, 1e12]])
+    assert covariance_of(good) == pytest.approx(np.linalg.inv(good))
+    near = np.outer(x := np.array([1.0, 1e7, 3e-4]), x) + np.eye(3) * 1e-9
+    near[0, 1] = near[1, 0] = near[0, 1] * (1.0 + 1e-9)
+    assert (np.diag(np.linalg.inv(near)) < 0.0).any()
+    assert (np.diag(covariance_of(near)) > 0.0).all()

@@ -13,7 +13,7 @@ from aeropend_ident.signals.signals import from_arrays
 from aeropend_ident.testing import bags
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import rig
-from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
 
 
 def columns(duration=6.0, **replaced):
@@ -350,3 +350,10 @@ def test_pieces_between_pauses_may_be_too_short_for_a_verdict(tmp_path):
     read_ = recording(np.cumsum(steps_ns) * 1e-9, **made)
     with pytest.raises(RecordingError, match="3 samples without a pause are too few for a verdict"):
         as_signals(read_, BENCH, fit_nominal=True)
+
+
+def test_a_reading_has_noise_where_the_model_states_none_and_readings_are_few():
+    duty = steps(8.0, 3)
+    columns = {**rig.record(drawn_rig(3, {}), duty, 3)[0], "duty": duty}
+    columns["v_a"] = np.where(np.arange(len(duty)) % 40 == 0, columns["v_a"], np.nan)
+    assert from_arrays(columns, SAMPLE_PERIOD, load("thesis").sensing).sigma["v_a"] > 0.0

@@ -18,6 +18,7 @@ from aeropend_ident.diagnosis.chain.values import limits, neutral, with_values
 from aeropend_ident.diagnosis.conclude import Statistical, interval
 from aeropend_ident.diagnosis.document import Change, DiagnosisDocument, DocumentError, Estimates, Since
 from aeropend_ident.diagnosis.joint_fit import SURE, WIDER, JointFit
+from aeropend_ident.estimation.map_fit import covariance_of
 from aeropend_ident.estimation.parameter import key
 from aeropend_sim.model.effects import DEFINED
 from aeropend_sim.model.parameters import Model, load
@@ -91,7 +92,7 @@ def estimates(joint: JointFit, statistical: Statistical) -> Estimates:
     names = [n for n in joint.values if not key(n).is_initial]
     of_fit = list(joint.fit.values)
     at = [of_fit.index(n) for n in names]
-    covariance = np.linalg.inv(joint.fit.information(joint.fit.ess))[np.ix_(at, at)]
+    covariance = covariance_of(joint.fit.information(joint.fit.ess))[np.ix_(at, at)]
     scale = np.array([joint.sd[n] for n in names]) / np.sqrt(np.diag(covariance))
     covariance *= np.outer(scale, scale)
     plain = list(dict.fromkeys(key(n).plain for n in names))

@@ -22,7 +22,7 @@ from aeropend_ident.diagnosis.joint_fit import WIDER, JointFit
 from aeropend_ident.diagnosis.search.findings import RankedHypothesis
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
 from aeropend_ident.diagnosis.search.selection import plausible
-from aeropend_ident.estimation.map_fit import Fit
+from aeropend_ident.estimation.map_fit import Fit, covariance_of
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.statistics import Z95, rms
 from aeropend_sim.model import actuator, dynamics
@@ -87,7 +87,7 @@ class Strengths:
         # thrust and voltage depend on parameters of the model; the motion is known from the readings
         by |= {p.name: p for stage in STAGES for p in model_parameters(self.joint.chains, stage)
                if p.name in THROUGH and p.name in f.values}
-        covariance = np.linalg.inv(f.information(f.ess))
+        covariance = covariance_of(f.information(f.ess))
         at = [names.index(name) for name in by]
         z = np.array([by[name].to_standard(values[name]) for name in by])
 

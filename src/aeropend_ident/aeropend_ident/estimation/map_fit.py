@@ -392,12 +392,24 @@ def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence
         changed = sum(abs(search.weight[k] - before[k]) >= WEIGHT_CHANGE * before[k] for k in before)
         if changed <= MAY_CHANGE * len(before):
             break
-    z, covariance = search.z, np.linalg.inv(information)
+    z, covariance = search.z, covariance_of(information)
     values = {p.name: p.value(x) for p, x in zip(parameters, z, strict=True)}
     sd = {p.name: abs(p.slope(x)) * float(np.sqrt(v)) for p, x, v in zip(parameters, z, np.diag(covariance),
                                                                          strict=True)}
     log_prior = 0.5 * float(np.linalg.slogdet(search.prior)[1] - z @ search.prior @ z)
     return Fit(values, sd, search.current, search.scale, search.ess, log_prior, products, search.prior)
+
+
+def covariance_of(information: Array) -> Array:
+    """Covariance (P, P) of estimates from their information matrix.
+
+    Rows of very different sizes are scaled to a diagonal of 1. An inverse of such a matrix has a diagonal of 1 or more;
+    one below, or below 0, is of rounding.
+    """
+    d = 1.0 / np.sqrt(np.diag(information))
+    inverse = np.linalg.inv(d[:, None] * information * d)
+    inverse[np.diag_indices_from(inverse)] = np.maximum(np.diag(inverse), 1.0)
+    return np.asarray(d[:, None] * inverse * d)
 
 
 def passed(deadline: float | None) -> bool:

@@ -107,7 +107,7 @@ def least_noise(x: Array) -> float:
     x = x[np.isfinite(x)]
     levels = np.unique(x)
     step = float(np.median(np.diff(levels))) if 1 < len(levels) < len(x) / 10 else 0.0
-    return max(step / math.sqrt(12.0), 1e-6 * float(np.ptp(x)), LEAST_NOISE)
+    return max(step / math.sqrt(12.0), 1e-6 * float(np.ptp(x)) if len(x) else 0.0, LEAST_NOISE)
 
 
 def innovation_noise(x: Array, duty: Array) -> float | None:

@@ -314,14 +314,15 @@ def _between_samples(duty: Array) -> tuple[Array, list[slice]]:
 def _noise(columns: Mapping[str, Array], duty: Array, sensing: Mapping[str, float], train: int) -> dict[str, float]:
     """Standard deviation of a reading by channel: as the readings show it, as the model states it if they are few.
 
-    The resolution counts in any case: while a coarse channel rests it shows no noise.
+    It is above 0, also where a model states no noise. The resolution counts in any case: while a coarse channel rests
+    it shows no noise.
     """
     sigma = {"omega": max(sensing["speed_noise"], white_noise(columns["omega"][:train]))}
     for channel, key in (("theta", "angle"), ("i_a", "current"), ("v_a", "voltage")):
         x, quantised = columns[channel][:train], sensing[f"{key}_lsb"] / math.sqrt(12.0)
         seen = innovation_noise(x, duty[:train])
         stated = math.hypot(sensing[f"{key}_noise"], quantised)
-        sigma[channel] = stated if seen is None else max(seen, quantised, least_noise(x))
+        sigma[channel] = max(stated if seen is None else max(seen, quantised), least_noise(x))
     return sigma
 
 
