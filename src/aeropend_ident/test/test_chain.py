@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from aeropend_ident.bags.reading import RecordingError
 from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
+from aeropend_ident.diagnosis.chain.nominal_fit import _possible
 from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.chain.values import STAGES
 from aeropend_ident.estimation.map_fit import Search
@@ -88,3 +90,12 @@ def test_a_channel_without_a_reading_to_fit_to_has_no_residual_and_any_delay():
 def test_a_sample_period_above_every_delay_has_a_delay_all_the_same():
     s = recorded(1, duration=8.0)
     assert CutChain.cut(BENCH, replace(s, period=1.0)).likeliest_delay({}) == 0.5
+
+
+def test_a_motor_that_is_faster_than_any_is_not_simulated_and_no_result(chains):
+    chain, fast = chains.each[0], {"J_m": 1e-12}
+    assert np.isnan(chain.motor(fast)[0]).all()
+    assert np.isfinite(chain.motor({"J_m": 1e-7})[0]).all()
+    assert _possible(BENCH, chains.recordings) is BENCH
+    with pytest.raises(RecordingError, match="no motor has the speed, current and voltage"):
+        _possible(chain.valued(fast), chains.recordings)

@@ -5,6 +5,8 @@ import pytest
 from sparse_data import STATES, TRUE, simulated
 
 from aeropend_ident.identification.dataset import from_arrays, from_readings
+from aeropend_ident.identification.output_error import Entries, Fitter
+from aeropend_ident.identification.output_error_selection import tracks
 from aeropend_ident.identification.problem import Problem
 from aeropend_ident.identification.terms import TermError, thesis_terms
 from aeropend_ident.testing.rigs import BENCH
@@ -61,3 +63,12 @@ def test_an_unknown_variable_is_named_with_those_of_the_user(measured):
 def test_a_term_that_is_too_large_to_compute_with_is_refused(measured):
     with pytest.raises(TermError, match=r"'omega\^300' is too large"):
         Problem(measured.data, ["omega", "omega^300"])
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_part_without_a_pulse_of_the_speed_has_no_spread_of_it(measured):
+    part = measured.experiment(20)
+    assert [len(mean.value) for mean in part.means] == [0]
+    fitter = Fitter(part, Entries.of(np.zeros(measured.candidates.shape)), 0, floor=1.0)
+    fitter.fit(rounds=1)
+    assert not tracks(fitter)  # a model without terms

@@ -325,7 +325,7 @@ def tracks(fitter: Fitter) -> bool:
     """Whether a fitted model stays near the readings, or within twice their noise, over the whole recording."""
     e = fitter.experiment
     spread = {o.name: float(np.nanstd(o.value)) / o.sigma for o in e.outputs}
-    spread |= {m.name: float(np.std(m.value / m.sigma)) for m in e.means}
+    spread |= {m.name: float(np.std(m.value / m.sigma)) for m in e.means if len(m.value)}
     return all(fitter.scale[k] < max(2.0, TRACKS * spread[k]) for k in spread)
 
 

@@ -36,6 +36,9 @@ DELAY = "command_delay.delay"
 RAN_AWAY = 1e9
 """Residual, in the unit of the channel, of a simulation that is not finite (choice: larger than any reading)."""
 
+SHORTEST_STEP = 5e-6
+"""[s] Step of a simulation below which the motor is none (choice: a winding has a time constant of 50 µs or more)."""
+
 VOLTAGE_SETTLES, SPEED_SETTLES = 0.05, 0.02
 """[s] Windows over which the rest of voltage and speed is averaged before it feeds the next stage.
 
@@ -159,7 +162,7 @@ class CutChain:
             stop: sample to stop at; None: all.
 
         Returns:
-            [A] current, [rad/s] speed and [rad] rotor angle, (N,) each.
+            [A] current, [rad/s] speed and [rad] rotor angle, (N,) each; NaN of values with which no motor is so fast.
         """
         first = float(self.signals.i_a[0]) if np.isfinite(self.signals.i_a[0]) else 0.0
         state = dynamics.State(i_a=first, omega=values.get("initial.omega", 0.0))
@@ -171,8 +174,9 @@ class CutChain:
         for piece, whole in self.pieces(values, stop):
             m = actuator.behind_terminals(whole)
             true = sensing.true_voltage(m, voltage[piece])
-            part = np.empty((3, len(true)))
-            state = dynamics.run_motor(true, state, *dynamics.prepare(m, self.signals.period), part)
+            part, prepared = np.full((3, len(true)), np.nan), dynamics.prepare(m, self.signals.period)
+            if prepared[0].h >= SHORTEST_STEP:
+                state = dynamics.run_motor(true, state, *prepared, part)
             out[:, piece] = part
         return out[0], out[1], out[2]
 

@@ -24,8 +24,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from aeropend_ident.bags.reading import RecordingError
 from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
-from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
+from aeropend_ident.diagnosis.chain.chain import SHORTEST_STEP, CutChain, CutChains
 from aeropend_ident.diagnosis.chain.driven_rig import fit_driven_rig
 from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.chain.values import STAGES, of_rig
@@ -108,14 +109,26 @@ def _stage_by_stage(model: Model, recordings: Sequence[Signals], policy: Policy,
     chains = CutChains(model, recordings, policy)
     for stage in STAGES:
         if stage == "motor":
-            chains = _cut_again(chains, _start_of_motor(chains))
+            chains = _cut_again(chains, _possible(_start_of_motor(chains), chains.recordings))
         elif stage == "arm":
             chains = _cut_again(chains, _start_of_arm(chains))
         chains, f = _likelier([chains, *_without_losses(chains)] if stage == "actuator" else [chains], stage,
                              deadline)
         if f.residuals:
-            chains = _cut_again(chains, chains.each[0].valued(of_rig(f.values)))
+            chains = _cut_again(chains, _possible(chains.each[0].valued(of_rig(f.values)), chains.recordings))
     return chains.model
+
+
+def _possible(model: Model, recordings: Sequence[Signals]) -> Model:
+    """The model, if it is that of a motor.
+
+    Raises:
+        RecordingError: no motor is so fast.
+    """
+    if any(dynamics.prepare(model, s.period)[0].h < SHORTEST_STEP for s in recordings):
+        raise RecordingError("no motor has the speed, current and voltage that were read: check their units, and that "
+                             "no column stands for another (doctor); no verdict is possible")
+    return model
 
 
 def _likelier(tried: Sequence[CutChains], stage: str, deadline: float | None) -> tuple[CutChains, Fit]:
