@@ -1,12 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """An effect of another form than the catalogue's is named, with its form, and its strength holds in any form."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.joint_fit import JointFit
 from aeropend_ident.diagnosis.report.candidates import form_text, strength_text
 from aeropend_ident.diagnosis.results import document, verdict_lines
+from aeropend_ident.diagnosis.search.findings import RankedHypothesis
+from aeropend_ident.diagnosis.search.hypotheses import hypotheses, other_forms
+from aeropend_ident.diagnosis.strength import Strengths
+from aeropend_ident.estimation.map_fit import estimate
 from aeropend_ident.testing.rigs import BENCH, recorded
 from aeropend_sim.model import effect_file
 from aeropend_sim.model.effects import family
@@ -77,3 +85,12 @@ def test_a_form_of_an_effect_file_is_tried():
     assert all(c.law != "test_forms_drag" for c in without.conclusions.which.candidates)
     assert with_.conclusions.closure.gap_after <= without.conclusions.closure.gap_after * 1.05
     assert np.isfinite(with_.conclusions.closure.gap_after)
+
+
+def test_a_form_that_is_no_formula_leaves_the_strength_open():
+    chains = CutChains(BENCH, [recorded(71, duration=8.0)])
+    delay = next(h for h in hypotheses(BENCH) if h.effect == "command_delay")
+    lag = other_forms(delay, chains)[0]
+    f = replace(estimate({}, {}), residuals={"v_a": np.ones(100)})
+    ranked = RankedHypothesis(lag, f, 1.0, 0.6, others=(RankedHypothesis(delay, f, 1.0, 0.4),))
+    assert Strengths(JointFit(chains, {}, f, {}, {}, {})).interval(ranked, "actuator", 0.0) is None

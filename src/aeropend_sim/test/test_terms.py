@@ -11,7 +11,7 @@ from aeropend_sim.model.dynamics import simulate
 from aeropend_sim.model.effects import DEFINED
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, load
 from aeropend_sim.model.rig import record
-from aeropend_sim.model.terms import series, terms
+from aeropend_sim.model.terms import along, series, terms
 
 BENCH = load("bench")
 DUTY = np.repeat(np.random.default_rng(3).uniform(0.1, 0.6, 8), 500)
@@ -155,3 +155,8 @@ def test_too_many_memories_are_refused():
         terms(with_(*(f"hose_{k}" for k in range(5))).effects)
     four = [f"hose_{k}" for k in range(4)]
     assert simulate(with_(*four, "as_drag"), DUTY).theta[-1] != simulate(with_(*four), DUTY).theta[-1]
+
+
+def test_what_is_no_formula_is_never_called():
+    with pytest.raises(ValueError, match="no formula"):
+        along("", {"delay": 0.1}, 10, 1e-3)

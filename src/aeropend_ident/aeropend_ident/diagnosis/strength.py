@@ -108,17 +108,20 @@ class Strengths:
     def interval(self, ranked: RankedHypothesis, stage: str, form: float) -> Interval | None:
         """The strength of an effect found with a 95 % interval over all its forms that explain the recording.
 
+        None if one of these is no formula.
+
         Args:
             ranked: the effect, with its forms.
             stage: in which it was found.
             form: relative error from another form that none of these is.
         """
         h = ranked.hypothesis
-        if h.parameter or not DEFINED[h.effect].formula:
+        others = plausible(ranked, stage)
+        if h.parameter or not all(DEFINED[one.effect].formula for one in (h, *(r.hypothesis for r in others))):
             return None
         value, sd = self.estimate(h, self.joint.fit, self.joint.values, form)
         low, high = value - Z95 * sd, value + Z95 * sd
-        for r in plausible(ranked, stage):
+        for r in others:
             x, sd = self.estimate(r.hypothesis, r.fit, r.fit.values, form)
             low, high = min(low, x - Z95 * sd), max(high, x + Z95 * sd)
         return Interval(value, max(low, 0.0), high)

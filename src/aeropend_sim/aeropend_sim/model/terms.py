@@ -129,7 +129,13 @@ def _where(e: Effect) -> str:
 
 
 def _held(rows: Sequence[tuple[int, int, int, Sequence[float]]], ends: Sequence[int]) -> Terms:
-    """Terms by the addresses of term and rate, slot of the memory and parameters; and the end of each place."""
+    """Terms by the addresses of term and rate, slot of the memory and parameters; and the end of each place.
+
+    Raises:
+        ValueError: a term has no address, since it is no formula.
+    """
+    if not all(term for term, *_ in rows):
+        raise ValueError("a term that is no formula cannot be called")
     numbers = np.array([float(x) for *_, own in rows for x in own])
     calls, at = np.zeros((len(rows), COLUMNS), dtype=np.int64), numbers.ctypes.data
     for call, (term, rate, slot, own) in zip(calls, rows, strict=True):
