@@ -8,12 +8,13 @@ import pytest
 
 from aeropend_ident.diagnosis.chain.driven_rig import Units, fit_driven_rig, fit_own, units_of
 from aeropend_ident.diagnosis.chain.hanging import mounted
+from aeropend_ident.diagnosis.chain.weak_start import FULL, curve
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.signals.from_bag import end_of_motion
 from aeropend_ident.signals.signals import Signals, from_arrays
 from aeropend_ident.testing.rigs import BENCH
-from aeropend_sim.model import dynamics
-from aeropend_sim.model.parameters import Model
+from aeropend_sim.model import actuator, dynamics
+from aeropend_sim.model.parameters import DUTY_MAP, Model
 
 PERIOD, NOISE = 0.01, 0.001
 
@@ -182,3 +183,9 @@ def test_a_command_that_explains_nothing_does_not_turn_the_sign():
     other = replace(s, duty=0.3 + 0.1 * np.sin(5.0 * np.arange(len(s)) * s.period))
     (found,) = mounted(BENCH, [other])
     assert not found.mounting.flipped
+
+
+@pytest.mark.parametrize("own", [{}, {**dict.fromkeys(DUTY_MAP, 0.0), "v_full": 3.0}])
+def test_a_static_curve_is_that_of_its_duties_also_of_a_model_without_a_map(own):
+    numbers = curve({**BENCH.model, **own}, 0.2, 0.1, 0.5, 0.1)
+    assert actuator.voltage(numbers, np.array([0.2, 1.0])) == pytest.approx([0.0, FULL], abs=1e-12)

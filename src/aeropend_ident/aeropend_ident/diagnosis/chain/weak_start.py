@@ -118,7 +118,7 @@ def curve(numbers: Mapping[str, float], dead: float, bend: float, load: float, l
         load: ratio of the voltages for load and back-EMF at full duty.
         lag: [s] of the rotor at full duty.
     """
-    n = dict(numbers)
+    n = {**numbers, "v_full": 0.0, "k2": numbers["k2"] or 1.0}  # a bridge without losses has no map: any k2 will do
     root = FULL / (math.sqrt(1.0 + bend) - math.sqrt(dead + bend))
     n["k1"] = root / math.sqrt(n["k2"])
     n["k3"] = bend * n["k2"]
