@@ -81,9 +81,10 @@ def test_the_equation_of_an_effect_is_that_of_the_catalogue(effect):
 @pytest.mark.parametrize("form", FORMS.values(), ids=lambda e: e.id)
 def test_a_form_has_its_row(form):
     text = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
-    (row,) = re.findall(rf"^\| {form.id} \| `(\w+)` \| `(.*?)`(.*) \| (.*) \|$", text, re.MULTILINE)
-    of, term, more, own = row
-    assert (of, term) == (form.form_of, form.term)
+    (row,) = re.findall(rf"^\| {form.id} \| `(\w+)` \| (.*) \| (.*) \|$", text, re.MULTILINE)
+    of, law, own = row
+    term, more = re.fullmatch(r"`(.*?)`(.*)", law).groups() if form.term else (law, "")
+    assert (of, term) == (form.form_of, form.term or form.physics)
     assert (f"d{form.memory}/dt = `{form.rate}`" in more) == bool(form.memory)
     assert ("sticks" in more) == form.sticks
     new = [(n, p.unit) for n, p in form.parameters.items() if n not in CATALOGUE[of].parameters and not p.refines]

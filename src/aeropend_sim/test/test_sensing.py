@@ -99,16 +99,17 @@ def test_noise_comes_before_quantisation():
 
 # --- angle filter
 
-def filtered(theta, time, tau):
-    """Two equal first-order stages, settled at the first angle, by scipy."""
+def filtered(theta, time, first, second):
+    """Two first-order stages, settled at the first angle, by scipy."""
     def stages(t, x):
-        return [(theta(t) - x[0]) / tau, (x[0] - x[1]) / tau]
+        return [(theta(t) - x[0]) / first, (x[0] - x[1]) / second]
     return solve_ivp(stages, (0.0, time[-1]), [theta(0.0)] * 2, "DOP853", time, rtol=1e-11, atol=1e-13).y[1]
 
 
+@pytest.mark.parametrize("more", [0.0, 0.04])
 @pytest.mark.parametrize(("period", "tau", "limit"), [
     (H, 4.7e-3, 2e-5), (H, 0.03, 1e-6), (H, 1e-3, 2e-4), (20e-3, 0.1, 2e-3), (50e-3, 0.5, 2e-3), (50e-3, 4.7e-3, 0.02)])
-def test_filter_meets_scipy(period, tau, limit):
+def test_filter_meets_scipy(period, tau, limit, more):
     def theta(t):
         return 0.4 + 0.3 * np.sin(12.0 * t) + 0.2 * np.cos(5.0 * t + 1.0)
 
@@ -116,9 +117,9 @@ def test_filter_meets_scipy(period, tau, limit):
         return 3.6 * np.cos(12.0 * t) - 1.0 * np.sin(5.0 * t + 1.0)
 
     time = np.arange(round(3.0 / period)) * period
-    c = chain(angle_filter_tau=tau, period=period)
+    c = chain({"encoder_lag_single": {"lag": more}}, angle_filter_tau=tau, period=period)
     found = read(states(len(time), theta=theta(time), theta_dot=theta_dot(time)), c)
-    expected = filtered(theta, time, tau)
+    expected = filtered(theta, time, tau, tau + more)
     assert np.abs(found[THETA] - expected).max() < limit * np.ptp(expected)
     again = sensing.angle_reading(theta(time), theta_dot(time), c)
     assert np.array_equal(again, found[THETA])
@@ -143,6 +144,12 @@ def test_encoder_lag_is_a_slower_filter():
     slower = read(s, chain({"encoder_lag": {"tau": 0.03}}, angle_filter_tau=4.7e-3))
     assert np.array_equal(slower, read(s, chain(angle_filter_tau=4.7e-3 + 0.03)))
     assert np.array_equal(read(s, chain({"encoder_lag": {"tau": 0.03}})), read(s, chain(angle_filter_tau=0.03)))
+
+
+def test_a_single_slow_stage_needs_no_other():
+    time = np.arange(1000) * H
+    found = read(states(1000, theta=0.7 * time, theta_dot=0.7), chain({"encoder_lag_single": {"lag": 0.06}}))
+    assert found[THETA][-1] == pytest.approx(0.7 * (time[-1] - 0.06), abs=1e-9)
 
 
 # --- effects of sensing

@@ -264,13 +264,13 @@ def _at(angles: Array, k: float) -> float:
 
 def _kalman(chain: sensing.MeasurementChain, damping: float, period: float) -> Array:
     """Stationary Kalman gains (5,): angle, rate, unknown torque and both stages of the angle filter."""
-    filtered = chain.filter_rate > 0.0
+    filtered = chain.first.rate > 0.0 and chain.second.rate > 0.0
     a = np.zeros((5, 5))
     a[0, 1] = a[1, 2] = 1.0
     a[1, 1] = -damping
     if filtered:
-        a[3, 0] = a[4, 3] = chain.filter_rate
-        a[3, 3] = a[4, 4] = -chain.filter_rate
+        a[3, 0], a[3, 3] = chain.first.rate, -chain.first.rate
+        a[4, 3], a[4, 4] = chain.second.rate, -chain.second.rate
     size, seen = (5, 4) if filtered else (3, 0)
     transition = expm(a[:size, :size] * period)
     kick = np.diag(np.array([0.0, 0.0, DISTURBANCE**2 * period, 0.0, 0.0])[:size])

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Other forms of the effects of the catalogue: the same physics, described by another law.
 
-A form is an effect by formula, as an effect file may hold it. Where it has a parameter of the effect, it has the same
+A form is an effect by formula, as an effect file may hold it, or one of the angle filter in `sensing`. Where it has a parameter of the effect, it has the same
 meaning there. The other parameters are its own; a parameter that `refines` is not fitted.
 """
 
@@ -21,8 +21,8 @@ def _form(id_: str, of: str, physics: str, term: str, own: dict[str, EffectParam
     words = set("".join(c if c.isalnum() or c == "_" else " " for c in f"{term} {rate}").split())
     shared = {name: p for name, p in effect.parameters.items() if name in words and name not in own}
     name, _, unit = memory.partition(" ")
-    return Effect(id_, effect.place, physics, {**shared, **own}, term=term, reading=effect.reading, memory=name,
-                  memory_unit=unit, rate=rate, sticks=sticks, form_of=of)
+    return Effect(id_, effect.place, physics, {**shared, **own}, effect.in_equations, term=term, reading=effect.reading,
+                  memory=name, memory_unit=unit, rate=rate, sticks=sticks, form_of=of)
 
 
 _ENTRIES = (
@@ -106,6 +106,8 @@ _ENTRIES = (
           "amplitude * sin(theta + phase) + second * sin(2 * theta + turn)",
           {"second": P("rad", 0.0, 0.01, 0.0, 0.3, "amplitude of the second harmonic"),
            "turn": P("rad", 0.0, 0.5, -math.pi, math.pi, "its phase")}),
+    _form("encoder_lag_single", "encoder_lag", "one of the two stages of the angle filter is slower, or faster", "",
+          {"lag": P("s", 0.0, 0.06, -0.5, 1.0, "time constant added to one stage of the filter")}),
     _form("current_gain_bent", "current_gain", "the scale error of the current changes with the current",
           "i_a * gain * (1 - bend * abs(i_a))",
           {"bend": P("1/A", 0.0, 0.05, -0.5, 0.5, "relative change of the error per current")}),

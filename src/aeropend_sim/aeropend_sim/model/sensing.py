@@ -33,12 +33,19 @@ SPEED_TIMEOUT = 0.5
 """[s] Time without a pulse after which the speed reads 0. Convention, as in the firmware (speed.h)."""
 
 
+class FilterStage(NamedTuple):
+    """One first-order stage of the angle filter: its weights over a sample, and its rate (1/s); 0 without the stage."""
+
+    weights: Lag
+    rate: float
+
+
 class MeasurementChain(NamedTuple):
     """The measurement chain of a model, precomputed for one sample period, in SI units."""
 
     h: float
-    filter: Lag
-    filter_rate: float
+    first: FilterStage
+    second: FilterStage
     bias: float
     amplitude: float
     phase: float
@@ -203,9 +210,10 @@ def read_angle(model: Model, theta: Array, theta_dot: Array, period: float = SAM
     return angle_reading(*seen_angle(model, theta, theta_dot, period), prepare(model, period))
 
 
-def angle_filter_tau(model: Model) -> float:
-    """[s] Time constant of each of the two stages of the angle filter, with the effect `encoder_lag`."""
-    return max(model.sensing["angle_filter_tau"] + model.effect("encoder_lag", "tau"), 0.0)
+def filter_stages(model: Model) -> tuple[float, float]:
+    """[s] Time constants of the two stages of the angle filter, with the effect `encoder_lag` in each of its forms."""
+    both = model.sensing["angle_filter_tau"] + model.effect("encoder_lag", "tau")
+    return max(both, 0.0), max(both + model.effect("encoder_lag_single", "lag"), 0.0)
 
 
 def prepare(model: Model, period: float = SAMPLE_PERIOD) -> MeasurementChain:
@@ -216,10 +224,10 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD) -> MeasurementChain:
         period: [s] time between samples.
     """
     s, effect = model.sensing, model.effect
-    tau = angle_filter_tau(model)
-    rate = 1.0 / tau if tau > NO_LAG * period else 0.0
+    first, second = (FilterStage(lag(rate, period), rate) for rate in (
+        1.0 / tau if tau > NO_LAG * period else 0.0 for tau in filter_stages(model)))
     return MeasurementChain(
-        h=period, filter=lag(rate, period), filter_rate=rate, bias=effect("angle_offset", "bias"),
+        h=period, first=first, second=second, bias=effect("angle_offset", "bias"),
         amplitude=effect("encoder_eccentricity", "amplitude"), phase=effect("encoder_eccentricity", "phase"),
         angle_noise=s["angle_noise"], angle_lsb=s["angle_lsb"],
         current_factor=1.0 + effect("current_gain", "gain"), current_bias=effect("current_offset", "bias"),
@@ -284,15 +292,23 @@ def filter_angle(m: Memory, theta: float, theta_dot: float, c: MeasurementChain)
         c: the chain.
     """
     now = encoder_angle(theta, c)
-    if c.filter_rate == 0.0:
+    if c.first.rate == 0.0 and c.second.rate == 0.0:
         return now, now
     before = encoder_angle(m.theta, c)
     middle = encoder_angle(0.5 * (m.theta + theta) + 0.125 * c.h * (m.theta_dot - theta_dot), c)
-    k, a = c.filter, c.filter_rate
-    half = k.half_decay * m.stage1 + a * (k.u0 * before + k.u1 * middle + k.u2 * now)
-    stage1 = k.decay * m.stage1 + a * (k.w0 * before + k.w1 * middle + k.w2 * now)
-    stage2 = k.decay * m.stage2 + a * (k.w0 * m.stage1 + k.w1 * half + k.w2 * stage1)
+    half, stage1 = _filtered(m.stage1, before, middle, now, c.first)
+    _, stage2 = _filtered(m.stage2, m.stage1, half, stage1, c.second)
     return stage1, stage2
+
+
+@njit()
+def _filtered(was: float, before: float, middle: float, now: float, stage: FilterStage) -> tuple[float, float]:
+    """Output of a stage in the middle and at the end of a period, for its input at the begin, there and there."""
+    if stage.rate == 0.0:
+        return middle, now
+    k, a = stage.weights, stage.rate
+    return (k.half_decay * was + a * (k.u0 * before + k.u1 * middle + k.u2 * now),
+            k.decay * was + a * (k.w0 * before + k.w1 * middle + k.w2 * now))
 
 
 @njit(nogil=True)

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from statistics import fmean
 
 import numpy as np
 from numpy.typing import NDArray
@@ -297,7 +298,7 @@ def angle_response(chain: CutChain, values: Mapping[str, float], drive: Array) -
     """Response (K, N) of the angle to torques over inertia (K, N), by channel."""
     model = chain.valued(values)
     n = model.numbers()
-    tau = sensing.angle_filter_tau(model)
+    tau = fmean(sensing.filter_stages(model))
     stiffness = n["mgd_over_J"] * np.cos(chain.arm_motion(values)[0])
     return {"theta": arm_response(drive, stiffness, n["c_over_J"], tau, chain.signals.period)}
 
