@@ -253,7 +253,7 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     if found.unknown is not None and not _repeats(parts, settings.material):
         found = replace(found, unknown=None)
         parts = _parts(found, joint, gaps, settings.jobs)
-    before, gap_before = (found, joint, gaps, parts), gaps.after.total
+    before = (found, joint, gaps, parts)
     if found.unknown is not None and _approximated(found.unknown, joint, gaps, parts):
         stage = found.unknown.stage
         stages = {**found.stages, stage: found.stages[stage].nothing()}
@@ -265,7 +265,7 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
             found = replace(found, recordings=[s.noted(NOT_LEARNED) for s in found.recordings])
         else:
             found, joint, gaps, parts = _with_learned_term(fitted, found, joint, gaps, parts, settings, progress)
-    if found.stages is not before[0].stages and not gaps.after.total < gap_before:
+    if found.stages is not before[0].stages and not _closes_more(gaps.after, *before[2:], settings.material):
         found, joint, gaps, parts = before  # what was taken back predicts as well as what can be learned in its place
     conclusions = _conclude(found, joint, gaps, parts, settings)
     model, chains = found.chains.model, found.chains
@@ -379,6 +379,12 @@ def _approximated(unknown: UnknownEffect, joint: JointFit, gaps: _Gaps, parts: S
     rest = sum(p.amount for p in parts if p.name == gap_share.UNKNOWN)
     others = [p.amount for p in parts if p.name and p.name not in {*names, gap_share.UNKNOWN}]
     return theirs.amount + rest > max(others, default=0.0)
+
+
+def _closes_more(learned: Gap, known: _Gaps, parts: Sequence[Part], material: float) -> bool:
+    """Whether a learned term closes a material share more of the gap than the known effects that it is in place of."""
+    open_ = sum(max(p.amount, 0.0) for p in parts)
+    return gap_share.squared(known.after) - gap_share.squared(learned) > material * open_
 
 
 def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Findings:

@@ -118,7 +118,7 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
 
     return [p for effects in stages for p in _adding_up(
         [_mean(part(h, after, gap([h])), part(h, gap(_but(effects, h)), gap(effects))) for h in effects],
-        _squared(gap(effects)) - _squared(after))]
+        squared(gap(effects)) - squared(after))]
 
 
 def _names(effects: Sequence[Hypothesis]) -> frozenset[str]:
@@ -154,7 +154,7 @@ def part_of_several(effects: Sequence[Hypothesis], joint: JointFit, held_out: He
 
 def _coming_back(name: str, place: str, without: Gap, after: Gap, unsure: float = 0.0) -> Part:
     """The part that comes back without some effects."""
-    return Part(name, place, _squared(without) - _squared(after), _windows(without) - _windows(after), unsure)
+    return Part(name, place, squared(without) - squared(after), _windows(without) - _windows(after), unsure)
 
 
 def unexplained(after: Gap, floors: Mapping[str, float], random: RankedHypothesis | None, unknown: Repeatable | None
@@ -286,7 +286,7 @@ def _ids(parts: Iterable[Part]) -> list[str]:
     return list(dict.fromkeys(p.name.partition(":")[0] for p in parts))
 
 
-def _squared(gap: Gap) -> float:
+def squared(gap: Gap) -> float:
     """The squared gap; a run that diverges counts as a constant, whose gap is 1."""
     return gap.total**2 if math.isfinite(gap.total) else 1.0
 

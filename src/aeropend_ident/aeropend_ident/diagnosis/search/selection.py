@@ -284,7 +284,8 @@ class SelectionRound:
 
         The true effect then has another form than the catalogue's. Each rival is given free curves at its own place.
         The right one needs them for its form only. A wrong one cannot correct, from its place, an error that arises
-        elsewhere. The likelihoods with free curves divide the total probability of the close rivals.
+        elsewhere. The likelihoods with free curves divide the total probability of the close rivals. If free curves
+        explain the whole misfit with none of them, more than a form is missing, and the evidence decides.
 
         Args:
             ranked: the best first.
@@ -300,6 +301,8 @@ class SelectionRound:
             own = [t for t in missing_terms(self.chains, self.stage, r.fit, adopted(self.known, r.hypothesis))
                    if t.place == r.hypothesis.place]
             left += [(t.left, t.ess) for t in own] or [(mean_square(r.fit, self.stage), 1.0)]
+        if min(x for x, _ in left) > FORM_SHOWS:  # more than a form is missing: what curves add may be another effect
+            return ranked
         count = max(n for _, n in left)
         evidence = np.array([-0.5 * count * math.log(max(x, 1.0)) for x, _ in left])
         weights = np.exp(evidence - evidence.max())
