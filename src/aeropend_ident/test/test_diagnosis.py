@@ -11,6 +11,7 @@ import pytest
 
 from aeropend_ident.diagnosis import diagnosis
 from aeropend_ident.diagnosis.diagnosis import Settings, diagnose
+from aeropend_ident.diagnosis.free_run_gap import Gap
 from aeropend_ident.diagnosis.gap_share import Part
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.diagnosis.results import document, verdict_lines
@@ -198,6 +199,22 @@ def test_the_most_harmful_effect_is_taken_out_alone_unless_the_gap_is_then_large
     found, _, _, parts = diagnosis._without_harmful(None, start, None, measured(None, start, None)[2], Settings(), None)
     assert found == {"b", "c"}
     assert [p.amount for p in parts] == [4.0, -0.5]
+
+
+def test_what_stays_open_is_unknown_though_the_joint_fit_closes_a_larger_misfit_elsewhere():
+    found = diagnose(BENCH, [recorded(71, {"voltage_offset": {"bias": 0.1}})], 2, left_out=["voltage_offset"])
+    assert found.conclusions.closure.closed < 0.6
+    assert found.body["which"]["verdict"] == "unknown"
+
+
+@pytest.mark.parametrize(("rms", "closes_more"), [(0.19, True), (0.199, False), (0.21, False)])
+def test_a_learned_term_replaces_effects_only_if_it_closes_materially_more(rms, closes_more):
+    def gap(rms):
+        return Gap({"theta": rms}, {"theta": 1.0}, np.full((1, 1), rms**2))
+
+    parts = [Part("cable_torque", "arm", 0.06, np.zeros(1)), Part("gust", "arm", -1.0, np.zeros(1))]
+    known = SimpleNamespace(after=gap(0.2))
+    assert diagnosis._closes_more(gap(rms), known, parts, material=0.03) == closes_more
 
 
 def test_effects_all_over_the_chain_are_found_and_nothing_else():

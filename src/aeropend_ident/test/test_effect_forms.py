@@ -74,6 +74,14 @@ def test_the_words_say_form_and_strength(verdict):
     assert "RMS" in text
 
 
+def test_a_lag_of_one_stage_of_the_filter_is_one_of_the_encoder():
+    found = diagnose(BENCH, [recorded(73, {"encoder_lag_single": {"lag": 0.12}}, duration=40.0)], 2)
+    which = found.conclusions.which
+    assert which.effects == ("encoder_lag",)
+    lag = next(c for c in which.candidates if c.effect == "encoder_lag").parameters["lag"]
+    assert lag.low <= 0.12 <= lag.high
+
+
 def test_a_form_of_an_effect_file_is_tried():
     effect_file.define({"test_forms_drag": {
         "place": "arm", "form_of": "quadratic_drag", "term": "-k * theta_dot * abs(theta_dot) * step(theta_dot)",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -247,8 +247,9 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     found, joint, gaps = _fit_and_measure(fitted, found, progress)
     if found.unknown is None and _changes_later(gaps):  # an unknown effect may show elsewhere in what follows
         return _diagnose(_fitted_further(fitted), settings, progress)
-    if found.unknown is not None and gaps.after.within(gaps.floors, CHANNELS_OF[found.unknown.stage]):
-        found = replace(found, unknown=None)
+    closed = [stage for stage in found.stages if gaps.after.within(gaps.floors, CHANNELS_OF[stage])]
+    if found.unknown is not None and found.unknown.stage in closed:
+        found = _judged(found, closed)
     found, joint, gaps, parts = _without_harmful(fitted, found, joint, gaps, settings, progress)
     if found.unknown is not None and not _repeats(parts, settings.material):
         found = replace(found, unknown=None)
@@ -358,9 +359,7 @@ def _without(found: _Findings, name: str) -> _Findings:
             stages[stage] = replace(f, found=kept, final=final)
     detected = gust.detect(found.chains, stages["arm"])
     stages["arm"] = detected.arm
-    unknown = unknown_effect.judge(found.chains, stages, gust=detected.gust is not None,
-                                   spikes=found.statistical.spikes is not None)
-    return replace(found, stages=stages, statistical=replace(found.statistical, gust=detected.gust), unknown=unknown)
+    return _judged(replace(found, stages=stages, statistical=replace(found.statistical, gust=detected.gust)))
 
 
 def _repeats(parts: Sequence[Part], material: float) -> bool:
@@ -423,8 +422,20 @@ def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Finding
     detected = gust.detect(chains, stages["arm"])
     stages = {**stages, "arm": detected.arm}
     misfit = regions.largest_misfit(chains, stages)
-    unknown = unknown_effect.judge(chains, stages, gust=detected.gust is not None, spikes=spikes is not None)
-    return _Findings(chains, stages, Statistical(detected.gust, spikes), unknown, misfit, recordings, onset=begun)
+    return _judged(_Findings(chains, stages, Statistical(detected.gust, spikes), None, misfit, recordings,
+                             onset=begun))
+
+
+def _judged(found: _Findings, closed: Collection[str] = ()) -> _Findings:
+    """The findings, with what they leave judged: whether it is an unknown effect.
+
+    Args:
+        found: the findings.
+        closed: stages in which the joint fit has closed the gap.
+    """
+    detected = found.statistical
+    return replace(found, unknown=unknown_effect.judge(
+        found.chains, found.stages, gust=detected.gust is not None, spikes=detected.spikes is not None, closed=closed))
 
 
 def _measure(fitted: CutChains, found: _Findings, joint: JointFit) -> _Gaps:

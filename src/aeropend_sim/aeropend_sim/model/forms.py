@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Other forms of the effects of the catalogue: the same physics, described by another law.
 
-A form is an effect by formula, as an effect file may hold it, or one of the angle filter in `sensing`. Where it has a parameter of the effect, it has the same
-meaning there. The other parameters are its own; a parameter that `refines` is not fitted.
+A form is an effect by formula, as an effect file may hold it, or one of the angle filter in `sensing`. Where it has a
+parameter of the effect, it has the same meaning there. The other parameters are its own; a parameter that `refines` is
+not fitted.
 """
 
 from __future__ import annotations

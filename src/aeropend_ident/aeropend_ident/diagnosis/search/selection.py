@@ -192,10 +192,11 @@ class SelectionRound:
         return better(tried, [w.result() if w else f for (_, f), w in zip(tried, work, strict=True)])
 
     def with_forms(self, tried: FittedHypotheses) -> FittedHypotheses:
-        """The hypotheses, and other forms of the contenders; of the likeliest alone if it explains all."""
+        """The hypotheses, and other forms of the contenders; if one explains all, of those that close as much."""
         likeliest = self._likeliest(tried)[:CONTENDERS]
         if mean_square(likeliest[0][2], self.stage) < FORM_SHOWS:
-            likeliest = likeliest[:1]
+            most = self._close_most([(h, f) for _, h, f in likeliest])
+            likeliest = [one for one, closes in zip(likeliest, most, strict=True) if closes]
         work = [[(form, [self._submit(replace(form, starts=(start,)), ROUNDS, begun=as_form(h, form, f.values))
                          for start in form.starts]) for form in other_forms(h, self.chains)] for _, h, f in likeliest]
         again: dict[str, Fit] = {}

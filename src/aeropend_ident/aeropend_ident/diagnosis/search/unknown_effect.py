@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,7 +102,8 @@ Misfits = Mapping[str, Mapping[str, Misfit]]
 """Stage -> channel -> misfit."""
 
 
-def judge(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool, spikes: bool) -> UnknownEffect | None:
+def judge(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool, spikes: bool,
+          closed: Collection[str] = ()) -> UnknownEffect | None:
     """The unknown effect, if there is one.
 
     Args:
@@ -110,6 +111,7 @@ def judge(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool, sp
         findings: stage -> what was found.
         gust: whether `gust` was detected: the rest of the angle is then no misfit of the model.
         spikes: whether `speed_spikes` was detected: false captures that were not recognised are then no misfit.
+        closed: stages in which the joint fit has closed the gap.
     """
     def misfits(fits: Mapping[str, Fit]) -> Misfits:
         return {b: {c: _misfit(chains, c, r) for c, r in f.residuals.items()
@@ -131,7 +133,7 @@ def judge(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool, sp
     terms: dict[str, MissingTerm] = {}
     instead: set[str] = set()
     for b, f in findings.items():
-        if not any(m.amount > 0.0 for m in base[b].values()):
+        if b in closed or not any(m.amount > 0.0 for m in base[b].values()):
             continue
         term = missing_terms(chains, b, f.base, known[b])[0]
         elsewhere = bool(f.found) and term.place not in {h.place for h in f.effects}
