@@ -124,8 +124,12 @@ def test_what_brakes_a_swing_is_named_at_20_hz_and_one_degree(effect, parameters
 
 
 def test_a_pooled_interval_holds_how_recordings_differ():
-    assert joint_fit.pooled_sd([1.0, 1.001, 0.999], [0.3, 0.3, 0.3]) == pytest.approx(0.3 / math.sqrt(3.0))
-    assert joint_fit.pooled_sd([1.0, 2.0, 3.0], [0.01, 0.01, 0.01]) == pytest.approx(1.0 / math.sqrt(3.0), rel=0.01)
+    alike, scattered = ([joint_fit.Estimate(x, sd) for x in values]
+                        for values, sd in (((1.0, 1.001, 0.999), 0.3), ((1.0, 2.0, 3.0), 0.01)))
+    assert joint_fit.run_to_run(alike) == 0.0
+    assert joint_fit.pooled_sd(alike) == pytest.approx(0.3 / math.sqrt(3.0))
+    assert joint_fit.run_to_run(scattered) == pytest.approx(1.0, rel=0.01)
+    assert joint_fit.pooled_sd(scattered) == pytest.approx(1.0 / math.sqrt(3.0), rel=0.01)
 
 
 @pytest.mark.promise("Uncalibrated rigs", "The interval of several recordings holds their run-to-run spread")

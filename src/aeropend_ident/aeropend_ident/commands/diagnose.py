@@ -14,6 +14,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 from rich import box
@@ -32,6 +33,8 @@ from aeropend_ident.diagnosis.validation import validate
 from aeropend_ident.result_folder import ensure_free, folder_names
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import Mounting
+from aeropend_ident.signals.variants import Variant, VariantError
+from aeropend_ident.signals.variants import read as read_variants
 from aeropend_sim.cli import browser
 from aeropend_sim.cli.command import Parser, between, entry_point, own
 from aeropend_sim.cli.progress import progress
@@ -40,6 +43,9 @@ from aeropend_sim.model import effect_file
 from aeropend_sim.model.parameters import PRESETS, load
 from aeropend_sim.untrusted import printable
 
+SAME = Variant("")
+"""The rig as the model states it."""
+
 BROKEN = 1
 """Exit code if the verdict breaks a rule of `--fail-on` (convention: 1 is the answer no)."""
 
@@ -47,6 +53,7 @@ EXAMPLES = """examples:
   diagnose my_bag                                compare a recording with the preset 'bench'
   diagnose monday tuesday --model rig.yaml       several recordings of one rig, fitted together
   diagnose monday --test tuesday                 fit one recording, and test on another how far the gap closes
+  diagnose empty loaded --variants variants.yaml known variants of a rig, as with a payload
   diagnose tuesday --since diagnosis_monday      what has changed since an earlier verdict of the rig (or several)
   diagnose --each rigs/* --out verdicts          recordings of different rigs: a verdict each, and a table
   diagnose --each rigs/* --dask tcp://host:8786  the same on a Dask cluster (pip install 'aeropend_ident[dask]')
@@ -99,6 +106,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--since", action="append", default=[], metavar="DIR",
                         help="folder of an earlier verdict of the rig, whose model is the nominal one: the verdict is "
                              "what has changed; several show how far the rig differs from run to run")
+    parser.add_argument("--variants", metavar="FILE",
+                        help="file that says which numbers of the model differ in which recordings, as with a payload "
+                             "or another propeller")
     parser.add_argument("--material", type=between(0.0, 1.0, "a share"), default=MATERIAL_SHARE, metavar="SHARE",
                         help="share of the gap from which an effect is claimed; smaller ones are listed as small "
                              f"(default: {MATERIAL_SHARE:g})")
@@ -124,6 +134,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         if options.since and getattr(options, other):
             parser.error(f"--since and --{other.replace('_', '-')} contradict each other: leave the second out"
                          + (", the earlier verdict has the model of the rig" if other != "each" else ""))
+    for other in ("fit_nominal", "each", "since"):
+        if options.variants and getattr(options, other):
+            parser.error(f"--variants and --{other.replace('_', '-')} contradict each other: leave one out")
     options.model = options.model or "bench"
     if options.open and options.each:
         parser.error("--open shows one report: leave --each out")
@@ -187,19 +200,29 @@ def run(options: argparse.Namespace, command: str, rules: Sequence[checks.Rule])
             print(printable(f"diagnose: {options.model} was identified by a diagnosis, and --since "
                             f"{Path(options.model).parent} knows how surely; with --model every parameter counts as "
                             "known to 5 %"), file=sys.stderr)
+    variants: dict[str, Variant] = {}
+    if options.variants:
+        variants = read_variants(options.variants, [*options.bags, *options.test], model)
+        if wrong := [bag for bag in options.test if variants.get(bag, SAME).unknown]:
+            raise VariantError(f"--test {wrong[0]}: {variants[wrong[0]].unknown[0]} is unknown there, so that no model "
+                               "can be tested on it; fit it along, or give the number")
+        options.bags = sorted(options.bags, key=variants.__contains__)  # the rig as the model states it comes first
     with progress("reading") as show:
         mounting = of_rig.mounting if of_rig else None
-        signals, tests = ([signals_of(bag, options.namespace, model, options.held_out, fit_nominal=uncalibrated,
-                                      mounting=mounting) for bag in bags]
+        signals, tests = ([signals_of(bag, options.namespace, variants.get(bag, SAME).of(model), options.held_out,
+                                      fit_nominal=uncalibrated, mounting=mounting) for bag in bags]
                           for bags in (options.bags, options.test))
         if of_rig is not None:
             signals = [(of_rig.mounting or Mounting()).of(s) for s in signals]
+        signals = [replace(s, variant=variants.get(bag)) for bag, s in zip(options.bags, signals, strict=True)]
         found = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal, material=options.material,
                          seconds=options.seconds, known=known, further=further,
                          progress=lambda what, share: show(share, what))
         alike = found.signals[0].mounting or Mounting()
         tests = [alike.of(s) for s in tests]
-        shown = [Across(bag, **vars(validate(found.model, found.augmented, s))) for bag, s in zip(options.test, tests)]
+        its = [variants.get(bag, SAME) for bag in options.test]
+        shown = [Across(bag, **vars(validate(v.of(found.model), v.of(found.augmented), s)))
+                 for bag, v, s in zip(options.test, its, tests, strict=True)]
         nominal = " and ".join(options.since) or options.model
         made = document(found, options.bags, nominal, time.monotonic() - started, shown)
         results = Results.of(found, made, command)

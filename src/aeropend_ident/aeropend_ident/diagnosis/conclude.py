@@ -21,9 +21,10 @@ from aeropend_ident.diagnosis.document import (
     Interval,
     NextExperiment,
     ParameterRow,
+    VariantFound,
 )
 from aeropend_ident.diagnosis.free_run_gap import HeldOut
-from aeropend_ident.diagnosis.joint_fit import WIDER, JointFit
+from aeropend_ident.diagnosis.joint_fit import WIDER, JointFit, run_to_run
 from aeropend_ident.diagnosis.policy import CALIBRATED, MATERIAL_SHARE, angle_only
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis
 from aeropend_ident.diagnosis.search.onset import Onset
@@ -67,11 +68,12 @@ def parameter_rows(chains: CutChains, joint: JointFit) -> dict[str, ParameterRow
     """
     nominal, values, sd = chains.model.model, joint.values, joint.sd
     if chains.policy.calibrated:
-        return {n: _row(neutral(chains.model, n), interval(values[n], sd[n])) for n in (*MODEL_NAMES, FILTER)
+        rows = {n: _row(neutral(chains.model, n), interval(values[n], sd[n])) for n in (*MODEL_NAMES, FILTER)
                 if n in values}
+        return {n: _with_runs(row, n, joint) for n, row in rows.items()}
     fitted = {p.name: p for stage in STAGES for p in model_parameters(chains, stage)}
     alone = angle_only(chains.recordings)
-    rows: dict[str, ParameterRow] = {}
+    rows = {}
     left_out = {name for name in (*OPTIONAL, *DUTY_MAP) if nominal[name] == 0.0}
     for n in (name for name in MODEL_NAMES if name not in left_out):
         ends = limits(n)
@@ -95,6 +97,40 @@ def parameter_rows(chains: CutChains, joint: JointFit) -> dict[str, ParameterRow
 
 def _row(nominal: float, estimate: Interval, determined: bool | None = None) -> ParameterRow:
     return ParameterRow(nominal, estimate.value, estimate.low, estimate.high, determined)
+
+
+def _with_runs(row: ParameterRow, name: str, joint: JointFit) -> ParameterRow:
+    """The row of a calibrated parameter, with what each of several recordings gives for it in its variant."""
+    chains = joint.chains
+    if name in joint.alone:
+        factors = [1.0 if s.variant is None else s.variant.factor.get(name, 1.0) for s in chains.recordings]
+        runs = tuple(interval(x * e.value, abs(x) * e.sd) for x, e in zip(factors, joint.alone[name], strict=True))
+        return replace(row, runs=runs, run_to_run=run_to_run(joint.alone[name]))
+    of_each = [key(name).of(k) if key(name).of(k) in joint.values else name for k in range(len(chains.each))]
+    if len(set(of_each)) == 1:
+        return row
+    return replace(row, runs=tuple(interval(joint.values[n], joint.sd[n]) for n in of_each))
+
+
+def variants(chains: CutChains, joint: JointFit) -> tuple[VariantFound, ...]:
+    """The variants of the rig among the recordings, with the numbers in which they differ.
+
+    Args:
+        chains: cut.
+        joint: the joint fit.
+    """
+    found: dict[str, VariantFound] = {}
+    for k, s in enumerate(chains.recordings):
+        if s.variant is None:
+            continue
+        known = {n: interval(x * joint.values[n], abs(x) * joint.sd[n]) for n, x in s.variant.factor.items()
+                 if n in joint.values}
+        own = {n: key(n).of(k) for n in s.variant.unknown}
+        unknown = {n: interval(joint.values[m], joint.sd[m]) for n, m in own.items() if m in joint.values}
+        one = found.setdefault(s.variant.name, VariantFound(s.variant.name, (), {}))
+        found[s.variant.name] = replace(one, recordings=(*one.recordings, k),
+                                        numbers={**known, **unknown, **one.numbers})
+    return tuple(found.values())
 
 
 @dataclass(frozen=True)
@@ -190,7 +226,9 @@ def candidates(joint: JointFit, statistical: Statistical, held_out: HeldOut, gap
                 rows[h.family] = Candidate(
                     effect, h.place, r.probability, estimates, h.name in claimed, after,
                     share.get(h.name) if mine else None, since, until, _finite(r.gain), None if mine else winner,
-                    "" if effect == h.effect else h.effect, r.forms or None, strength)
+                    "" if effect == h.effect else h.effect, r.forms or None, strength,
+                    {key(p.name).name: run_to_run(joint.alone[p.name]) for p in h.own if p.name in joint.alone} or None
+                    if mine else None)
     for extra in statistical.found:
         h = extra.hypothesis
         estimates = {key(n).name: interval(v, extra.fit.sd[n], 0.0) for n, v in extra.fit.values.items()}

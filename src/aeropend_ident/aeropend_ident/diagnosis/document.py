@@ -120,6 +120,8 @@ class Candidate:
         forms: [0..1] form -> probability among the forms of the effect; null if no other form was tried.
         strength: RMS of its term over the fitted part, in the unit of a term at its place, of a dry friction where it
             moves; the interval is over all forms that explain the recording. Null if the term is no formula.
+        run_to_run: name -> standard deviation of a parameter between recordings, beyond the uncertainty of the
+            estimates; null of a single recording.
     """
 
     effect: str
@@ -136,6 +138,7 @@ class Candidate:
     form: str = ""
     forms: Mapping[str, float] | None = None
     strength: Interval | None = None
+    run_to_run: Mapping[str, float] | None = None
 
     @property
     def law(self) -> str:
@@ -153,8 +156,10 @@ class ParameterRow:
         low: lower end of the 95 % interval.
         high: upper end of the 95 % interval.
         determined: whether the recordings determine it; uncalibrated rigs only.
-        runs: estimate of each recording, if each has its own.
-        run_to_run: standard deviation between recordings, beyond the uncertainty of the estimates.
+        runs: estimate of each recording in its variant, if there are several; of a calibrated rig with each recording
+            fitted alone.
+        run_to_run: standard deviation between recordings, beyond the uncertainty of the estimates; null of a number
+            that differs by an unknown amount in a variant.
     """
 
     nominal: float
@@ -164,6 +169,22 @@ class ParameterRow:
     determined: bool | None = None
     runs: tuple[Interval, ...] | None = None
     run_to_run: float | None = None
+
+
+@dataclass(frozen=True)
+class VariantFound:
+    """A variant of the rig, as with a payload.
+
+    Attributes:
+        name: of the variant.
+        recordings: numbers of its recordings, in the order of `bags`, from 0.
+        numbers: name -> value in the variant, of each number in which it differs; of one that is unknown, that of the
+            first of these recordings.
+    """
+
+    name: str
+    recordings: tuple[int, ...]
+    numbers: Mapping[str, Interval]
 
 
 @dataclass(frozen=True)
@@ -513,6 +534,7 @@ class Conclusions:
         identified: uncalibrated rigs only.
         since: only where earlier verdicts were given.
         estimates: of the augmented model; left out if no verdict could be found.
+        variants: of the rig, if some were given.
     """
 
     channels: Mapping[str, Channel]
@@ -522,6 +544,7 @@ class Conclusions:
     identified: Identified | None = None
     since: Since | None = None
     estimates: Estimates | None = None
+    variants: tuple[VariantFound, ...] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -543,6 +566,7 @@ class DiagnosisDocument:
         identified: uncalibrated rigs only.
         since: what has changed, only where earlier verdicts were given.
         estimates: of the augmented model; left out if no verdict could be found.
+        variants: of the rig, if some were given.
         notes: what is unusual in the data, as sentences.
         seconds: [s] time taken.
     """
@@ -561,6 +585,7 @@ class DiagnosisDocument:
     identified: Identified | None = None
     since: Since | None = None
     estimates: Estimates | None = None
+    variants: tuple[VariantFound, ...] | None = None
     notes: tuple[str, ...]
     seconds: float
 

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +66,13 @@ class Check:
     form: float
 
 
+class Estimate(NamedTuple):
+    """An estimate and its standard deviation."""
+
+    value: float
+    sd: float
+
+
 @dataclass(frozen=True)
 class JointFit:
     """The joint fit of everything found.
@@ -76,6 +84,7 @@ class JointFit:
         values: name -> estimate.
         sd: name -> standard deviation, with the uncertainty from the form of an effect.
         checks: stage -> tests of what is left of it.
+        alone: name -> estimate and standard deviation of each of several calibrated recordings, fitted alone.
     """
 
     chains: CutChains
@@ -84,6 +93,7 @@ class JointFit:
     values: dict[str, float]
     sd: dict[str, float]
     checks: dict[str, Check]
+    alone: dict[str, tuple[Estimate, ...]] = field(default_factory=dict)
     _fitted_without: dict[frozenset[str], dict[str, float]] = field(default_factory=dict, repr=False)
 
     @property
@@ -168,20 +178,29 @@ class JointFit:
         return {n: min(max(every[n].value(x), every[n].low), every[n].high) for n, x in zip(names, z, strict=True)}
 
 
-def pooled_sd(values: Sequence[float], sd: Sequence[float]) -> float:
-    """Standard deviation of the mean over recordings, with the scatter from recording to recording.
+def run_to_run(estimates: Sequence[Estimate]) -> float:
+    """Standard deviation between recordings, beyond the uncertainty of the estimates.
 
     Random effects, by moments (R. DerSimonian, N. Laird: Meta-analysis in clinical trials. 1986).
 
     Args:
-        values: (R,) estimates, one a recording.
-        sd: (R,) their standard deviations.
+        estimates: one a recording.
     """
-    x, variance = np.asarray(values), np.square(sd)
+    x, variance = np.array([e.value for e in estimates]), np.square([e.sd for e in estimates])
     w = 1.0 / variance
     scatter = float(np.sum(w * (x - np.average(x, weights=w)) ** 2))
     between = (scatter - (len(x) - 1)) / float(np.sum(w) - np.sum(w**2) / np.sum(w))
-    return 1.0 / math.sqrt(float(np.sum(1.0 / (variance + max(between, 0.0)))))
+    return math.sqrt(max(between, 0.0))
+
+
+def pooled_sd(estimates: Sequence[Estimate]) -> float:
+    """Standard deviation of the mean over recordings, with the scatter from recording to recording.
+
+    Args:
+        estimates: one a recording.
+    """
+    between = run_to_run(estimates)
+    return 1.0 / math.sqrt(sum(1.0 / (e.sd**2 + between**2) for e in estimates))
 
 
 def fit_jointly(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool) -> JointFit:
@@ -193,11 +212,11 @@ def fit_jointly(chains: CutChains, findings: Mapping[str, Findings], *, gust: bo
         gust: whether `gust` was detected: the rest of the angle then says nothing of the form of an effect.
     """
     found = dict(findings)
-    joint, values, sd = _fitted(chains, found)
+    joint, values, sd, alone = _fitted(chains, found)
     while weak := _least_certain(chains, found, joint, sd):
         stage, selection = weak
         found[stage] = found[stage].without(selection)
-        joint, values, sd = _fitted(chains, found)
+        joint, values, sd, alone = _fitted(chains, found)
     checks = _checks(chains, found)
 
     def widened() -> dict[str, float]:
@@ -208,42 +227,39 @@ def fit_jointly(chains: CutChains, findings: Mapping[str, Findings], *, gust: bo
         stage, selection = weak
         f = found[stage].without(selection)
         found[stage] = replace(f, final=refit(chains, stage, f.effects, f.final.values))
-        joint, values, sd = _fitted(chains, found)
+        joint, values, sd, alone = _fitted(chains, found)
         checks = _checks(chains, found)
-    return JointFit(chains, found, joint, values, widened(), checks)
+    return JointFit(chains, found, joint, values, widened(), checks, alone)
 
 
-def _fitted(chains: CutChains, findings: Mapping[str, Findings]) -> tuple[Fit, dict[str, float], dict[str, float]]:
-    """The fit of everything on the whole chain, with its estimates and their standard deviations."""
+def _fitted(chains: CutChains, findings: Mapping[str, Findings]
+            ) -> tuple[Fit, dict[str, float], dict[str, float], dict[str, tuple[Estimate, ...]]]:
+    """The fit of everything on the whole chain: estimates, standard deviations, and what each recording alone gives."""
     start: dict[str, float] = {}
     for f in findings.values():
         start.update(f.final.values)
     joint = fit(chains.joined(_free_run_residuals(chains)), started(_parameters(chains, findings).values(), start))
-    return joint, joint.values, _with_run_to_run(chains, findings, joint)
-
-
-def _with_run_to_run(chains: CutChains, findings: Mapping[str, Findings], joint: Fit) -> dict[str, float]:
-    """Standard deviations of a joint fit; those of shared values hold how they differ between recordings.
-
-    Each recording is fitted alone, from the values of all.
-    """
+    alone = _of_each_alone(chains, findings, joint)
     sd = {name: WIDER * s for name, s in joint.sd.items()}
+    sd |= {name: max(sd[name], pooled_sd(estimates)) for name, estimates in alone.items()}
+    return joint, joint.values, sd, alone
+
+
+def _of_each_alone(chains: CutChains, findings: Mapping[str, Findings], joint: Fit) -> dict[str, tuple[Estimate, ...]]:
+    """The estimates of values that several recordings share, with each recording fitted alone."""
     if len(chains.each) < 2:
-        return sd
+        return {}
     alone = []
     for k in range(len(chains.each)):
-        one, start = chains.only(k), chains.values_of(joint.values, k)
+        one, start = chains.only(k), chains.estimates_of(joint.values, k)
         residuals = one.joined(_free_run_residuals(one))
         sizes = [h.own[0].name for f in findings.values() for h in f.effects]
         starts = [start, *({**start, n: factor * start[n]} for n in sizes for factor in OTHER_SIZES)]
         fits = [fit(residuals, started(_parameters(one, findings).values(), s)) for s in starts]
         alone.append(max(fits, key=lambda f: f.log_likelihood + f.log_prior))
-    own = {key(name).plain for name in sd if key(name).recording}
-    for name, alike in joint.sd.items():
-        if not key(name).is_initial and key(name).plain not in own and all(name in f.values for f in alone):
-            values, own_sd = [f.values[name] for f in alone], [WIDER * f.sd[name] for f in alone]
-            sd[name] = max(WIDER * alike, pooled_sd(values, own_sd))
-    return sd
+    own = {key(name).plain for name in joint.sd if key(name).recording}
+    return {name: tuple(Estimate(f.values[name], WIDER * f.sd[name]) for f in alone) for name in joint.sd
+            if not key(name).is_initial and key(name).plain not in own and all(name in f.values for f in alone)}
 
 
 def _parameters(chains: CutChains, findings: Mapping[str, Findings]) -> dict[str, Parameter]:

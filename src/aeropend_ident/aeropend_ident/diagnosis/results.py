@@ -23,6 +23,7 @@ from aeropend_ident.diagnosis.document import (
     Interval,
     NextExperiment,
     ParameterRow,
+    VariantFound,
     to_json,
 )
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
@@ -35,7 +36,7 @@ from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import effect_file
 from aeropend_sim.model.parameters import Model, save
 from aeropend_sim.untrusted import printable
-from aeropend_sim.wording import enumerated
+from aeropend_sim.wording import counted, enumerated
 
 FILES = ("diagnosis.json", "report.html", "augmented.yaml")
 """Names of the files that a diagnosis writes."""
@@ -129,7 +130,7 @@ def document(diagnosis: Diagnosis, bags: Sequence[str], model: str, seconds: flo
         samples=sum(s.samples for s in signals), train_s=(0.0, round(train, 3)),
         held_out_s=(round(train, 3), round(duration, 3)), channels=c.channels, where=c.where, which=c.which,
         closure=replace(c.closure, across=tuple(across)), identified=c.identified,
-        since=c.since, estimates=c.estimates,
+        since=c.since, estimates=c.estimates, variants=c.variants,
         notes=tuple(_notes(signals, bags)), seconds=round(seconds, 2))
 
 
@@ -178,6 +179,7 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
         lines.append(f"  next: {experiment(which.next_experiment)}")
     if document.identified is not None:
         lines.append(f"  {identified_line(document.identified, which.numbers, document.duration_s)}")
+    lines += [variant_line(v) for v in document.variants or ()]
     if document.since is not None:
         lines += changes.lines(document.since)
     lines.append(gap_line("gap on held-out data", closure))
@@ -211,6 +213,13 @@ def identified_line(identified: Identified, rows: Mapping[str, ParameterRow], du
     left = ", ".join(identified.not_determined)
     return (f"identified from {identified.basis}: {', '.join(texts) or 'nothing'}"
             + (f"; not determined: {left}" if left else ""))
+
+
+def variant_line(variant: VariantFound) -> str:
+    """A variant of the rig in one line."""
+    texts = [f"{n} = {plain(x.value)} ({plain(x.low)} to {plain(x.high)}){_unit(n)}"
+             for n, x in variant.numbers.items()]
+    return f"  variant {variant.name} ({counted(len(variant.recordings), 'recording')}): {', '.join(texts)}"
 
 
 def _unit(name: str) -> str:
@@ -264,8 +273,9 @@ def experiment(advice: NextExperiment) -> str:
 
 def describe(candidate: Candidate) -> str:
     """A candidate's parameters with units and 95 % intervals, and its share of the gap."""
-    texts = [f"{name} = {plain(p.value)} ({plain(p.low)} to {plain(p.high)}) {unit_of(candidate.law, name)}"
-             for name, p in candidate.parameters.items()]
+    spread = {name: f", run to run {plain(sd, 2)}" for name, sd in (candidate.run_to_run or {}).items() if sd}
+    texts = [f"{name} = {plain(p.value)} ({plain(p.low)} to {plain(p.high)}{spread.get(name, '')}) "
+             f"{unit_of(candidate.law, name)}" for name, p in candidate.parameters.items()]
     when = [f"; {word} at {plain_time(t.value)} s ({plain_time(t.low)} to {plain_time(t.high)} s)"
             for word, t in (("begins", candidate.since), ("ends", candidate.until)) if t]
     more = [f"; {_spaced(text)}" for text in (form_text(candidate), strength_text(candidate)) if text]

@@ -89,7 +89,8 @@ def estimates(joint: JointFit, statistical: Statistical) -> Estimates:
         joint: the joint fit.
         statistical: effects that were detected by their statistics.
     """
-    names = [n for n in joint.values if not key(n).is_initial]
+    own = not joint.chains.policy.calibrated  # of a calibrated rig only numbers of variants are a recording's own
+    names = [n for n in joint.values if not key(n).is_initial and (own or not key(n).recording)]
     of_fit = list(joint.fit.values)
     at = [of_fit.index(n) for n in names]
     covariance = covariance_of(joint.fit.information(joint.fit.ess))[np.ix_(at, at)]
@@ -99,16 +100,16 @@ def estimates(joint: JointFit, statistical: Statistical) -> Estimates:
     mean = np.array([[float(key(n).plain == p) for n in names] for p in plain])
     mean /= mean.sum(axis=1, keepdims=True)
     values = np.array([joint.values[n] for n in names])
-    own = mean @ covariance @ mean.T
+    spread = mean @ covariance @ mean.T
     for j, weights in enumerate(mean):
         runs = values[weights > 0.0]
         if len(runs) > 1:  # a further recording differs from the mean by the scatter between recordings
-            own[j, j] += max(float(np.var(runs, ddof=1)) - own[j, j], 0.0)
+            spread[j, j] += max(float(np.var(runs, ddof=1)) - spread[j, j], 0.0)
     random = {n: (v, s.fit.sd[n]) for s in statistical.found for n, v in s.fit.values.items()}
-    own = block_diag(own, np.diag([sd**2 for _, sd in random.values()]))
-    own = 0.5 * (own + own.T)  # the inverse of an ill-conditioned matrix is symmetric only to a few digits
+    spread = block_diag(spread, np.diag([sd**2 for _, sd in random.values()]))
+    spread = 0.5 * (spread + spread.T)  # the inverse of an ill-conditioned matrix is symmetric only to a few digits
     return Estimates((*plain, *random), (*(mean @ values).tolist(), *(v for v, _ in random.values())),
-                     tuple(tuple(row) for row in own.tolist()))
+                     tuple(tuple(row) for row in spread.tolist()))
 
 
 def changes(known: Known, joint: JointFit, statistical: Statistical, claimed: Container[str]) -> Since:

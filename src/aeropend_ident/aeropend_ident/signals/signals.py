@@ -16,6 +16,7 @@ from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.signals.noise import innovation_noise, least_noise, white_noise
 from aeropend_ident.signals.outliers import far_from_median, jumps_out, saturated
 from aeropend_ident.signals.pulses import UNSURE, Pulses, find_pulses, hold
+from aeropend_ident.signals.variants import Variant
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 from aeropend_sim.wording import counted
@@ -104,6 +105,7 @@ class Signals:
         mounting: of the angle's sensor, if it was found from the motion; `theta` is right then.
         window: first sample at which effects act that the model lacks, and the first at which they act no more; None:
             they act all the time.
+        variant: of the rig in this recording; None: the rig as the model states it.
     """
 
     period: float
@@ -119,6 +121,7 @@ class Signals:
     notes: tuple[str, ...] = ()
     window: tuple[int, int] | None = None
     mounting: Mounting | None = None
+    variant: Variant | None = None
 
     def __len__(self) -> int:
         return len(self.duty)

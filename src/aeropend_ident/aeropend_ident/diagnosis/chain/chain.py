@@ -258,6 +258,7 @@ class CutChains:
     """The cut chains of several recordings of one rig.
 
     Parameters and effects are shared; initial states, and what differs between recordings, are each recording's own.
+    What is known to differ in a variant of the rig follows the shared value by its factor.
     Names of values and channels of recording k > 0 end in `@k`; see `estimation.parameter.Key`.
 
     Args:
@@ -288,13 +289,21 @@ class CutChains:
         return out
 
     def _cut(self, signals: Signals) -> CutChain:
-        return CutChain.cut(self.model, signals)
+        return CutChain.cut(self.model if signals.variant is None else signals.variant.of(self.model), signals)
 
     def values_of(self, values: Values, k: int) -> dict[str, float]:
-        """The values that act on recording k, under plain names."""
-        return self._values_of_each(values)[k]
+        """The values that act on recording k, under plain names; those of its variant."""
+        return self._acting(values)[k]
 
-    def _values_of_each(self, values: Values) -> list[dict[str, float]]:
+    def estimates_of(self, values: Values, k: int) -> dict[str, float]:
+        """The estimates that hold for recording k, under plain names; before the factors of its variant."""
+        return self._estimates_of_each(values)[k]
+
+    def _acting(self, values: Values) -> list[dict[str, float]]:
+        return [own if chain.signals.variant is None else chain.signals.variant.acting(own, self.model)
+                for chain, own in zip(self.each, self._estimates_of_each(values), strict=True)]
+
+    def _estimates_of_each(self, values: Values) -> list[dict[str, float]]:
         shared: dict[str, float] = {}
         own: list[dict[str, float]] = [{} for _ in self.each]
         for name, value in values.items():
@@ -313,7 +322,7 @@ class CutChains:
         """One residual function over all recordings, from one of a single recording."""
         def function(values: Values) -> dict[str, Array]:
             return {key(channel).of(k): r
-                    for k, (chain, own) in enumerate(zip(self.each, self._values_of_each(values)))
+                    for k, (chain, own) in enumerate(zip(self.each, self._acting(values), strict=True))
                     for channel, r in of(chain, own).items()}
 
         return function

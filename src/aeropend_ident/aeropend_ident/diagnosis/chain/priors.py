@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from aeropend_ident.diagnosis.chain.chain import DELAY, CutChains
-from aeropend_ident.diagnosis.chain.values import FILTER, STAGES, absent_at
+from aeropend_ident.diagnosis.chain.values import FILTER, STAGES, absent_at, limits
 from aeropend_ident.diagnosis.policy import angle_only, free_swinging
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.signals import STILL, Signals
@@ -134,10 +134,27 @@ def model_parameters(chains: CutChains, stage: str) -> list[Parameter]:
         if stage == "arm" and tau > 0.0:
             reach = OUTSIDE * CHAIN_SD * tau
             parameters.append(Parameter(FILTER, tau, CHAIN_SD * tau, tau - reach, tau + reach))
-        return parameters
+        return [own for p in parameters for own in _of_variants(p, recordings)]
     if stage == "arm":
         parameters.append(_filter(chains.model))
     return _of_each(parameters, len(recordings))
+
+
+def _of_variants(p: Parameter, recordings: Sequence[Signals]) -> list[Parameter]:
+    """A calibrated parameter, and one for each recording of a variant that does not know it."""
+    unknown = [s.variant is not None and p.name in s.variant.unknown for s in recordings]
+    if not any(unknown):
+        return [p]
+    own = [k for k in range(1, len(recordings)) if unknown[k] or unknown[0]]
+    return [replace(_unknown(p) if unknown[k] else p, name=key(p.name).of(k)) for k in (0, *own)]
+
+
+def _unknown(p: Parameter) -> Parameter:
+    """A parameter that is known to a factor of three at best."""
+    ends = limits(p.name)
+    if p.mean > 0.0:
+        return Parameter(p.name, p.mean, UNCALIBRATED_SD, max(ends.low, 1e-12), ends.high, log=True)
+    return Parameter(p.name, p.mean, UNCALIBRATED_SD * abs(p.mean), ends.low, ends.high)
 
 
 def nominal_sd(chains: CutChains, name: str) -> float:

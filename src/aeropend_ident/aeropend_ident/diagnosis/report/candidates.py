@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from aeropend_ident.diagnosis.document import CANNOT_TELL, Candidate, DiagnosisDocument, Interval, NextExperiment
 from aeropend_ident.diagnosis.policy import CALIBRATED
-from aeropend_ident.diagnosis.report.number_format import interval, minus, percent, probability, with_unit
+from aeropend_ident.diagnosis.report.number_format import interval, minus, percent, probability, quantity, with_unit
 from aeropend_ident.diagnosis.report.sentence import NONE, SAME_END
 from aeropend_sim.model.effect_file import unit_of as unit_of_term
 from aeropend_sim.model.effects import DEFINED, PARAMETER_MISMATCH
@@ -185,6 +185,8 @@ def _row(document: DiagnosisDocument, c: Candidate) -> CandidateRow:
     estimates = []
     for name, q in c.parameters.items():
         value, between = interval(q.value, q.low, q.high)
+        if spread := (c.run_to_run or {}).get(name):
+            between += f"; run to run {quantity(spread, digits=2)}"
         estimates.append(Estimate(name, with_unit(value, unit_of(c.law, name)), between))
     physics = minus(f"{PARAMETERS[f'model.{parameter}'].description}; its value is off" if parameter
                     else DEFINED[c.law].physics)

@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-from aeropend_ident.diagnosis.document import DiagnosisDocument, Lift
+from aeropend_ident.diagnosis.document import DiagnosisDocument, Lift, VariantFound
 from aeropend_ident.diagnosis.report.number_format import exact, interval, quantity
 from aeropend_sim.model.parameters import parameter
 
@@ -68,6 +69,21 @@ class IdentifiedText:
 
 
 @dataclass(frozen=True)
+class VariantText:
+    """A variant of the rig.
+
+    Attributes:
+        name: of the variant.
+        bags: its recordings.
+        numbers: in which it differs, each with its value.
+    """
+
+    name: str
+    bags: list[str]
+    numbers: list[tuple[str, str]]
+
+
+@dataclass(frozen=True)
 class Parameters:
     """The content of the section.
 
@@ -76,12 +92,14 @@ class Parameters:
         reach: shift at the edges of the pictures.
         off: [%] shift above which a parameter is marked.
         identified: of an uncalibrated rig.
+        variants: of the rig, each with the numbers in which it differs.
     """
 
     rows: list[ParameterRowText]
     reach: float
     off: str
     identified: IdentifiedText | None
+    variants: list[VariantText]
 
     def at(self, shift: float) -> float:
         """[%] Position of a shift in the picture; in the middle if it is not known."""
@@ -101,13 +119,25 @@ def section(document: DiagnosisDocument) -> Parameters:
             continue
         p = parameter(name)
         value, between = interval(n.value, n.low, n.high)
+        if n.run_to_run and document.identified is None:
+            between += f"; run to run {quantity(n.run_to_run, digits=2)}"
         scale = abs(n.nominal) or 1.0
         shift, low, high = ((x - n.nominal) / scale for x in (n.value, n.low, n.high))
         rows.append(ParameterRowText(name, "" if p.unit == "-" else p.unit, p.description, exact(n.nominal), value,
                                      between, shift, low, high, abs(shift) > OFF))
     shifts = [x for r in rows for x in (r.shift, r.low, r.high) if math.isfinite(x)]
     reach = max([2.0 * OFF, *(1.05 * min(abs(x), 1.0) for x in shifts)])
-    return Parameters(rows, reach, f"{100.0 * OFF:g}", _identified(document))
+    return Parameters(rows, reach, f"{100.0 * OFF:g}", _identified(document),
+                      [_variant(v, document.bags) for v in document.variants or ()])
+
+
+def _variant(variant: VariantFound, bags: Sequence[str]) -> VariantText:
+    numbers = []
+    for name, x in variant.numbers.items():
+        value, between = interval(x.value, x.low, x.high)
+        unit = parameter(name).unit
+        numbers.append((name, f"{value}{'' if unit == '-' else f' {unit}'} ({between})"))
+    return VariantText(variant.name, [bags[k] for k in variant.recordings], numbers)
 
 
 def lift_text(lift: Lift, duration: float) -> str:
