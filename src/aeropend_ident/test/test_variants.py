@@ -65,8 +65,8 @@ def test_the_numbers_of_a_variant_are_those_that_differ(found):
     assert rows["k_thrust"].run_to_run is None
 
 
-@pytest.mark.promise("Verdict", "Several recordings of one rig say of every shared number how far it differs from run to "
-                     "run")
+@pytest.mark.promise("Verdict", "Several recordings of one rig say of every shared number how far it differs from run "
+                     "to run")
 def test_every_shared_number_has_its_spread_from_run_to_run(found):
     rows = found.conclusions.which.numbers
     shared = {n: row for n, row in rows.items() if n not in PROPELLER}
@@ -141,7 +141,7 @@ def test_a_model_file_says_what_differs(tmp_path):
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(VariantError, match="nowhere.yaml: the file of variants cannot be read"):
+    with pytest.raises(VariantError, match=r"nowhere\.yaml: the file of variants cannot be read"):
         read(tmp_path / "nowhere.yaml", ["a"], BENCH)
 
 
