@@ -15,7 +15,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),
         (f"share/{PACKAGE}/launch",
-         [f"{PACKAGE}/launch/{name}.launch.yaml" for name in ("experiment", "hardware", "sim")]),
+         [f"{PACKAGE}/launch/{name}.launch.yaml" for name in ("experiment", "hardware", "live", "sim")]),
     ],
     install_requires=["Jinja2", "joblib", "lz4", "numba", "numpy", "openpyxl", "pysindy", "PyYAML", "rich", "rosbags",
                       "scipy", "threadpoolctl", "tornado"],
