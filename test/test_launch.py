@@ -93,3 +93,24 @@ def test_each_topic_can_be_remapped_in_two_namespaces(graph, start):
     graph.until(lambda: ends() == expected, "all topics under their new names")
     found = {name for name, _ in graph.node.get_topic_names_and_types()}
     assert not {f"{rig}/{topic}" for rig in rigs for topic in names} & found
+
+
+def test_what_plant_pose_and_watch_publish_besides_can_be_remapped_too(graph, start):
+    published = {interface.TRUTH_JOINT_STATES: {"plant"}, interface.TRUTH_ARMATURE: {"plant"}, interface.POSE: {"pose"},
+                 interface.MODEL_JOINT_STATES: {"watch"}, interface.MODEL_ARMATURE: {"watch"},
+                 interface.DIAGNOSTICS: {"plant", "pose", "watch"}, interface.JOINT_STATES: {"plant"},
+                 interface.ARMATURE: {"plant"}}
+    old = {topic: topic if topic.startswith("/") else f"/rig/{topic}" for topic in published}
+    new = {topic: f"{name}_of_mine" for topic, name in old.items()}
+    remaps = ["-r", "__ns:=/rig", *(word for topic, name in new.items() for word in ("-r", f"{topic}:={name}"))]
+    start("plant", *parameters(publish_truth=True), *remaps)
+    start("pose", "--ros-args", *remaps)
+    start("watch", *parameters(bags="''"), *remaps)
+
+    def publishers():
+        return {topic: {end.node_name for end in graph.node.get_publishers_info_by_topic(name)}
+                for topic, name in new.items()}
+
+    graph.until(lambda: publishers() == published, "all topics under their new names")
+    graph.until(lambda: graph.node.count_subscribers(new[interface.JOINT_STATES]) == 2, "pose and watch to listen")
+    assert not set(old.values()) & {name for name, _ in graph.node.get_topic_names_and_types()}
