@@ -10,6 +10,7 @@ from aeropend_ident.identification.output_error import (
     Fitter,
     low_frequency_power_ratio,
     scaled_solve,
+    standard_deviations,
     to_unit_diagonal,
 )
 from aeropend_ident.identification.problem import Problem
@@ -45,7 +46,7 @@ def test_coefficients_are_fitted_in_one_shot_and_in_several(length):
     fitter = linear(length)
     assert fitter.fit()
     assert fitter.model.value == pytest.approx([-2.0, 1.0], rel=0.01)
-    assert (np.abs(fitter.model.value - [-2.0, 1.0]) < 5.0 * np.sqrt(np.diag(fitter.covariance()))).all()
+    assert (np.abs(fitter.model.value - [-2.0, 1.0]) < 5.0 * fitter.deviations()).all()
 
 
 def test_a_state_restores_all_that_fitting_changes():
@@ -90,3 +91,21 @@ def test_a_diagonal_that_rounding_made_negative_is_not_scaled():
     assert to_unit_diagonal(H).tolist() == [1.0, 1e-18]
     with pytest.raises(np.linalg.LinAlgError):
         scaled_solve(H, np.ones(2))
+
+
+def test_coefficients_that_cannot_be_told_apart_have_a_standard_deviation():
+    rng = np.random.default_rng(0)
+    with np.errstate(all="raise"):
+        for _ in range(20):  # rounding makes some of the smallest eigenvalues negative
+            slopes = rng.standard_normal((50, 2)) @ rng.standard_normal((2, 8)) * 10.0 ** rng.integers(-8, 8, 8)
+            slopes[:, 3] = 0.0
+            deviations = standard_deviations(slopes.T @ slopes)
+            assert np.isinf(deviations[3])
+            alone = 1.0 / np.sqrt(np.delete((slopes**2).sum(axis=0), 3))
+            assert (np.delete(deviations, 3) >= 0.999 * alone).all()
+
+
+def test_standard_deviations_are_those_of_the_inverse():
+    slopes = np.random.default_rng(0).standard_normal((50, 4)) * [1.0, 1e3, 1e-3, 10.0]
+    information = slopes.T @ slopes
+    assert standard_deviations(information) == pytest.approx(np.sqrt(np.diag(np.linalg.inv(information))))

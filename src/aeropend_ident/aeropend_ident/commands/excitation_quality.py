@@ -7,6 +7,7 @@ A planned signal of `excite`, before it is recorded, or a recording.
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Sequence
 
@@ -66,7 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         remark = "poorly excited" if one.poor else ""
         if one.rivals:
             remark = f"cannot be distinguished from {', '.join(one.rivals)}"
-        known = f"known to {100.0 * one.sigma / abs(one.value):8.3g} %"
+        share = 100.0 * one.sigma / abs(one.value)
+        known = f"known to {share:8.3g} %" if math.isfinite(share) else f"{'not shown by it':19}"
         print(f"d({one.equation})/dt  {one.term:18} {one.value:12.6g}  {known}  {remark}".rstrip())
     poor = sum(one.poor for one in found)
     print(f"{poor} of {len(found)} terms would stay undetermined" if poor else "every term is excited")

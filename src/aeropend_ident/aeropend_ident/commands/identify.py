@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import time
 from collections.abc import Sequence
@@ -48,8 +49,9 @@ def document(found: Identified, data: Dataset, bag: str, model: str, seconds: fl
         seconds: [s] run time of the command.
     """
     return {"format": FORMAT, "method": found.method, "terms": list(found.terms), "equations": found.equations,
-            "sigma": found.sigma, "held_out_mse": found.held_out_mse, "seconds": round(seconds, 2),
-            "bag": bag, "model": model, "states": list(data.states), "inputs": list(data.inputs),
+            "sigma": {state: {term: sd if math.isfinite(sd) else None for term, sd in terms.items()}
+                      for state, terms in found.sigma.items()},
+            "held_out_mse": found.held_out_mse, "seconds": round(seconds, 2), "bag": bag, "model": model, "states": list(data.states), "inputs": list(data.inputs),
             "duration_s": round(len(data) * data.period, 3), "samples": len(data),
             "train_s": [0.0, round(data.train * data.period, 3)],
             "held_out_s": [round(data.train * data.period, 3), round(len(data) * data.period, 3)],
@@ -86,10 +88,11 @@ def _term(found: Identified, state: str, term: str) -> str:
     rivals = [a.instead for a in found.alternatives if (a.equation, a.term) == (state, term)]
     doubts = [f"or {', '.join(rivals)}"] if rivals else []
     often = found.stability.get(state, {}).get(term, 1.0)
+    doubts += ["the recording does not show it"] if math.isinf(sd) else []
     doubts += [f"in {100.0 * often:.0f} % of resamples"] if often < STABLE else []
     shown = f"{term} [undetermined: {'; '.join(doubts)}]" if doubts else term
     name = " constant" if term == "1" else f" {shown}"
-    size = f"{abs(c):.6g}" if sd == 0.0 else f"({abs(c):.6g} ± {sd:.2g})"
+    size = f"{abs(c):.6g}" if sd == 0.0 or math.isinf(sd) else f"({abs(c):.6g} ± {sd:.2g})"
     return ("- " if c < 0.0 else "+ ") + size + name
 
 

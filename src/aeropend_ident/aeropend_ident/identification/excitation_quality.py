@@ -95,7 +95,7 @@ def quality(model: Model, data: Dataset, show: Show = nothing) -> list[Excited]:
     fitter.fit(rounds=5)
     show(0.5, "testing every term")
     misfit, now, _ = linearise(fitter, every, start.shape)
-    sigma = np.sqrt(np.diag(fitter.covariance()))
+    sigma = fitter.deviations()
     rivals = list(alternatives(misfit, every, now))
     found = []
     for k, (e, t) in enumerate(zip(fitter.model.equation.tolist(), fitter.model.term.tolist())):

@@ -527,15 +527,14 @@ class Fitter:
                 break
             states = finer
 
-    def covariance(self) -> Array:
-        """Covariance (E, E) of the coefficients at the present model."""
+    def deviations(self) -> Array:
+        """Standard deviations (E,) of the coefficients at the present model; infinite for one that nothing shows."""
         states = self.run(self.model, self.initial)
         assert states is not None
         residuals = self.residuals(states)
         self.reweigh(residuals)
         normal, _ = self.normal_equations(states, self.model, residuals)
-        d = to_unit_diagonal(normal.H)
-        return d[:, None] * np.linalg.pinv(d[:, None] * normal.H * d, hermitian=True) * d
+        return standard_deviations(normal.H)
 
 
 def low_frequency_power_ratio(r: Array) -> float:
@@ -566,6 +565,17 @@ def to_unit_diagonal(H: Array) -> Array:
     """(P,) Factors of rows and columns that make the diagonal 1; 1 where an element is 0, or below it by rounding."""
     diagonal = np.diag(H)
     return np.where(diagonal > 0.0, 1.0 / np.sqrt(np.maximum(diagonal, 1e-300)), 1.0)
+
+
+def standard_deviations(H: Array) -> Array:
+    """Standard deviations (P,) of coefficients with the information matrix H (P, P); infinite where it holds nothing.
+
+    The variance of a coefficient is at least what it is while the others are known: in the scaled matrix, 1. Less, or
+    below 0, is of rounding where coefficients cannot be told apart.
+    """
+    d = to_unit_diagonal(H)
+    variances = np.diag(np.linalg.pinv(d[:, None] * H * d, hermitian=True))
+    return np.where(np.diag(H) > 0.0, d * np.sqrt(np.maximum(variances, 1.0)), np.inf)
 
 
 def scaled_solve(H: Array, g: Array) -> Array:

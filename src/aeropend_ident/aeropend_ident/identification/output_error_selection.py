@@ -270,7 +270,7 @@ def select_terms(experiment: Experiment, start: Array, candidates: Array, shot: 
     matrix, sigma, stability = np.zeros(start.shape), np.zeros(start.shape), np.zeros(start.shape)
     stability[every.equation, every.term] = often
     matrix[fitter.model.equation, fitter.model.term] = fitter.model.value
-    sigma[fitter.model.equation, fitter.model.term] = np.sqrt(np.diag(fitter.covariance()))
+    sigma[fitter.model.equation, fitter.model.term] = fitter.deviations()
     return SelectedModel(matrix, sigma, stability, unstable, fitter, list(alternatives(misfit, every, now)))
 
 

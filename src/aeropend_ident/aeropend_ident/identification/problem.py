@@ -15,7 +15,7 @@ import numpy as np
 from aeropend_ident.identification import dataset
 from aeropend_ident.identification.dataset import Dataset
 from aeropend_ident.identification.discrepancy import Equations
-from aeropend_ident.identification.output_error import Entries, Experiment, Fitter
+from aeropend_ident.identification.output_error import Entries, Experiment, Fitter, standard_deviations
 from aeropend_ident.identification.output_error_selection import MOST, SelectedModel, select_terms, tracks
 from aeropend_ident.identification.sindy import Regression, regress
 from aeropend_ident.identification.subset_selection import NormalEquations, ebic_search
@@ -141,7 +141,7 @@ class Problem:
                 known = self._known_rate(k, d.values[: d.train], d.held[: d.train], mean=False)
                 sums = NormalEquations.total(regression.blocks(k, matrix[k], known))
                 variance = sums.misfit(matrix[k]) / max(sums.n - len(s), 1.0)
-                out[k, s] = np.sqrt(variance * np.diag(np.linalg.pinv(sums.H[np.ix_(s, s)], hermitian=True)))
+                out[k, s] = math.sqrt(variance) * standard_deviations(sums.H[np.ix_(s, s)])
         return out
 
     def _known_rate(self, equation: int, x: Array, u: Array, *, mean: bool) -> Array | None:
