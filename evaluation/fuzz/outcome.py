@@ -15,7 +15,7 @@ from aeropend_ident.bags.recording import read
 
 NAN = re.compile(r"(?<![\w./%-])[-+]?(nan|inf|infinity|Infinity)(?![\w/-])")
 """A number that is none, as Python shows it; messages that speak of it write NaN."""
-REPEATED = re.compile(r"'[^']*'|is not a|is infinity|give .* <=|no possible number")
+REPEATED = re.compile(r"'[^']*'|is not a|is infinity|give (a number|.* <=)|no possible number")
 """Lines that repeat what was given."""
 NODE_SAYS = re.compile(r"\[(INFO|WARN)\]")
 TOLD = "was identified by a diagnosis"

@@ -51,7 +51,8 @@ def document(found: Identified, data: Dataset, bag: str, model: str, seconds: fl
     return {"format": FORMAT, "method": found.method, "terms": list(found.terms), "equations": found.equations,
             "sigma": {state: {term: sd if math.isfinite(sd) else None for term, sd in terms.items()}
                       for state, terms in found.sigma.items()},
-            "held_out_mse": found.held_out_mse, "seconds": round(seconds, 2), "bag": bag, "model": model, "states": list(data.states), "inputs": list(data.inputs),
+            "held_out_mse": found.held_out_mse, "seconds": round(seconds, 2), "bag": bag, "model": model,
+            "states": list(data.states), "inputs": list(data.inputs),
             "duration_s": round(len(data) * data.period, 3), "samples": len(data),
             "train_s": [0.0, round(data.train * data.period, 3)],
             "held_out_s": [round(data.train * data.period, 3), round(len(data) * data.period, 3)],
