@@ -19,7 +19,7 @@ ifneq ($(CURDIR)$(PYTHON),$(shell cat .venv/.tree 2>/dev/null))
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo live test bench blind real habits sensitivity regression soak coverage lint clean distclean
+.PHONY: help demo live test bench blind real habits sensitivity regression soak fuzz coverage lint clean distclean
 
 help: ## show this
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' Makefile | expand -t 20
@@ -59,6 +59,9 @@ regression: .venv/.dev ## compare the results of this tree with those of another
 soak: .venv/.runtime ## run a loop for 30 minutes under load, then with faults (ARGS="--minutes 5 --seed 3")
 	tools/setup firmware
 	$(BIN)/python -m evaluation.soak $(ARGS)
+
+fuzz: .venv/.dev ## try commands with recordings of arbitrary values (ARGS="--command import --minutes 10 --seed 1")
+	$(BIN)/python -m evaluation.fuzz $(ARGS)
 
 coverage: .venv/.dev ## tell which lines no test without nodes reaches
 	$(BIN)/python -m pytest -q -n auto --dist loadscope -m "not live" --cov --cov-report=term-missing:skip-covered $(ARGS)

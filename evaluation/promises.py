@@ -24,6 +24,7 @@ MEASURED = (
     ("The figures on calibrated rigs", "make blind", "docs/results/blind.md"),
     ("The figures on uncalibrated rigs", 'make blind ARGS="--uncalibrated"', "docs/results/uncalibrated.md"),
     ("Speed, memory and growth beside peers", "make bench", "docs/results/bench.md"),
+    ("A result or one line, whatever values a recording holds, for ten minutes a command", "make fuzz", ""),
     ("Behaviour under load and faults for half an hour", "make soak", "docs/results/soak.md"),
     ("Step responses of the four laws in the whole graph", "python -m evaluation.control_graph",
      "docs/results/control.md"),

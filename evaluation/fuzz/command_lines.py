@@ -256,5 +256,5 @@ COMMANDS = {
     "excitation_quality": Command(f"{_COMMANDS}.excitation_quality", excitation_quality, mildness=0.65,
                                   first=()),
     "import": Command(f"{_COMMANDS}.import_table", import_),
-    "doctor": Command(f"{_COMMANDS}.doctor", doctor, mildness=0.65, several=0.4),
+    "doctor": Command(f"{_COMMANDS}.doctor", doctor, mildness=0.65, several=0.4, first=()),
 }

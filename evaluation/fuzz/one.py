@@ -85,8 +85,9 @@ def _child(pipe: Connection, command: str, seed: int, folder: Path, files: Path)
         pipe.send(("fault", f"the case could not be drawn: {traceback.format_exc()}"))
         os._exit(3)
     pipe.send(("case", (words, story)))
-    for number, name in ((1, ".stdout"), (2, ".stderr")):
-        os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        os.dup2(os.open(f".{name}", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
+        setattr(sys, name, os.fdopen(number, "w"))
     sys.argv = [command]
     warnings.resetwarnings()
     warnings.simplefilter("always")
