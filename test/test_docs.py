@@ -20,6 +20,7 @@ from aeropend_ident.diagnosis.document import schema
 from aeropend_ident.identification.discrepancy import in_library
 from aeropend_ident.testing import bags, rigs
 from aeropend_sim import record
+from aeropend_sim.cli.command import called
 from aeropend_sim.cli.completion import commands
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.forms import FORMS
@@ -304,7 +305,8 @@ def test_import_proposes_what_the_guide_shows(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
     assert import_table.main(["messung.csv"]) == 2
-    said = [line.split() for line in capsys.readouterr().out.splitlines()]
+    out = capsys.readouterr().out.replace(called("import", "aeropend_ident"), ".venv/bin/import")
+    said = [line.split() for line in out.splitlines()]
     assert [line for line in shown.splitlines() if line.split() not in said] == []
 
 

@@ -57,7 +57,7 @@ def one(seed: int, number: int, folder: Path) -> tuple[str, str, Drawn]:
     text = said.getvalue()
     if code == 0:
         return ("right" if same(bag, made.truth) else "wrong"), text, made
-    return ("asked" if "  import " in text or "say --" in text else "refused"), text, made
+    return ("asked" if "import: nothing imported" in text or "say --" in text else "refused"), text, made
 
 
 def same(bag: Path, truth: Truth) -> bool:

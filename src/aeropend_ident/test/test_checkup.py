@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aeropend_ident.bags.recording import read
+from aeropend_ident.bags.recording import RecordingError, read
 from aeropend_ident.checkup import bag as of_bag
 from aeropend_ident.checkup import installation, model_file
 from aeropend_ident.commands.doctor import main
+from aeropend_ident.signals.from_bag import as_signals
 from aeropend_ident.testing.rigs import BENCH, drawn_rig
 from aeropend_sim.model import rig
 from aeropend_sim.model.excitation import Excitation
@@ -50,10 +51,10 @@ def test_a_good_recording_is_ok(path):
 
 
 @pytest.mark.parametrize(("change", "level", "words"), [
-    (lambda r: {"theta": r.theta * 180.0 / np.pi}, "warning", "`import bag bag_mended --theta theta:deg` mends it"),
-    (lambda r: {"theta": -r.theta}, "warning", "`import bag bag_mended --flip` mends it"),
+    (lambda r: {"theta": r.theta * 180.0 / np.pi}, "warning", "bag bag_mended --theta theta:deg` writes a mended copy"),
+    (lambda r: {"theta": -r.theta}, "warning", "import bag bag_mended --flip` writes a mended copy to bag_mended"),
     (lambda r: {"theta": np.roll(r.theta, len(r) // 2)}, "warning", "hardly follows the duty"),
-    (lambda r: {"theta": r.theta + 0.4}, "warning", "`import bag bag_mended --zero start` mends it"),
+    (lambda r: {"theta": r.theta + 0.4}, "warning", "bag bag_mended --zero start` writes a mended copy"),
     (lambda r: {"theta": r.theta * 1e-3}, "warning", "the arm hardly moves"),
     (lambda r: {"theta": np.full(len(r), np.nan)}, "error", "no arm angle"),
     (lambda r: {"duty": np.full(len(r), 0.3)}, "warning", "the duty stays at 0.3"),
@@ -74,8 +75,9 @@ def test_what_the_model_shows_is_said_first_with_the_command_that_mends_it(bags,
     bag = bags.write(tmp_path / "bag", bags.content(len(columns["duty"]), columns=columns | changed))
     (first, *more) = bad(of_bag.checks(str(bag), BENCH))
     assert words in first[1]
-    assert f"`import {bag} {bag}_mended --" in first[1]
-    assert [text for _, text in more] == ["diagnose refuses it before this is mended"]
+    assert f"import {bag} {bag}_mended --" in first[1]
+    assert [text for _, text in more] == [
+        "diagnose refuses it until this is mended; diagnose --uncalibrated needs no model"]
 
 
 def test_a_reading_that_is_left_out_is_no_ok(bags, tmp_path, columns):
@@ -179,3 +181,48 @@ def test_doctor_says_one_line_for_each_finding(tmp_path, monkeypatch, capsys):
                                                              "rig.yaml"}
     assert main(["no_such_bag"]) == 2
     assert "error    no_such_bag: " in capsys.readouterr().out
+
+
+@pytest.mark.promise("Commands", "`doctor` ends with exit code 2 where `diagnose` would refuse the recording")
+@pytest.mark.parametrize(("factors", "code"), [({}, 0), ({"theta": 180.0 / np.pi}, 2), ({"theta": 0.0}, 2)])
+def test_doctor_ends_as_diagnose_does(bags, tmp_path, monkeypatch, columns, factors, code):
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    changed = {name: factor * columns[name] for name, factor in factors.items()}
+    bag = bags.write(tmp_path / "bag", bags.content(len(columns["duty"]), columns=columns | changed))
+    assert main([str(bag)]) == code
+    try:
+        as_signals(read(bag), BENCH)
+    except RecordingError:
+        assert code == 2
+    else:
+        assert code == 0
+
+
+def test_recordings_are_checked_with_the_model_file_that_is_named_beside_them(bags, tmp_path, monkeypatch, capsys):
+    other = replace(BENCH, model={**BENCH.model, "mgd_over_J": 6.0 * BENCH.model["mgd_over_J"]})
+    duty = np.concatenate([np.zeros(500), Excitation(duration=12.0).series()])
+    columns = {**rig.record(other, duty, 1)[0], "duty": duty}
+    bag = bags.write(tmp_path / "bag", bags.content(len(duty), columns=columns))
+    save(other, tmp_path / "rig.yaml")
+    said = []
+    for words in ([], [str(tmp_path / "rig.yaml")]):
+        main([str(bag), *words])
+        said.append([line for line in capsys.readouterr().out.splitlines() if "it looks as if" in line])
+    assert said[0]
+    assert not said[1]
+
+
+@pytest.mark.parametrize("effect", [None, "coulomb_friction", "cable_torque"])
+def test_an_effect_does_not_make_a_good_excitation_poor(bags, tmp_path, effect):
+    duty = Excitation(duration=SECONDS).series()
+    columns = {**rig.record(drawn_rig(3, {effect: {}} if effect else {}), duty, 1)[0], "duty": duty}
+    found = list(of_bag.checks(str(bags.write(tmp_path / "bag", bags.content(len(duty), columns=columns))), BENCH))
+    assert found[-1].text == "diagnose can use it; every term of the model is excited"
+
+
+def test_a_single_step_excites_little(bags, tmp_path):
+    duty = np.repeat([0.0, 0.3], [1000, 6000])
+    columns = {**rig.record(BENCH, duty, 1)[0], "duty": duty}
+    found = list(of_bag.checks(str(bags.write(tmp_path / "bag", bags.content(len(duty), columns=columns))), BENCH))
+    assert found[-1].level == "warning"
+    assert "it hardly excites" in found[-1].text

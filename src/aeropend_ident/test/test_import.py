@@ -29,6 +29,7 @@ from aeropend_ident.bags.cdr import decode, encode
 from aeropend_ident.bags.recording import read
 from aeropend_ident.commands import diagnose
 from aeropend_ident.commands.import_table import main
+from aeropend_sim.cli.command import called
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import load
 from aeropend_sim.model.rig import record
@@ -39,8 +40,9 @@ def proposed(capsys, path):
     assert main([str(path)]) == 2
     out, err = capsys.readouterr()
     assert "--accept" in err
-    (command,) = (line for line in out.splitlines() if line.startswith("  import "))
-    return shlex.split(command)[1:], out
+    program = called("import", "aeropend_ident")
+    (command,) = (line for line in out.splitlines() if line.startswith(f"  {program} "))
+    return shlex.split(command.removeprefix(f"  {program}")), out
 
 
 @pytest.mark.promise("Tables", "`import` shows the columns of a file and proposes their meaning")

@@ -73,7 +73,7 @@ def test_duties_that_are_no_fractions_are_refused_with_the_command_that_mends_th
     bag = written(bags, tmp_path, columns={"duty": np.linspace(0.0, full, N)})
     with pytest.raises(RecordingError) as refused:
         read(bag)
-    assert re.search(f"duty goes from 0 to {full:g}, .*`import .* .*_mended --duty duty:{option}` ", str(refused.value))
+    assert re.search(f"duty goes from 0 to {full:g}, .*import .* .*_mended --duty duty:{option}` ", str(refused.value))
     assert "exchanged" not in str(refused.value)
     assert read(bag, judged=False).duty[-1] == full
 
@@ -105,8 +105,8 @@ def test_one_message_of_other_joints_takes_no_channel_away(bags, tmp_path):
     assert np.isfinite(named("one", ["臂", "转子"], ["arm", "rotor"]).theta).sum() == N - 1
     recording = named("all", ["pole", "fan"], ["pole", "fan"])
     assert "has no joint named arm or rotor (its joints: fan, pole): left out" in recording.notes[0]
-    assert "if pole is the arm, `import" in recording.notes[0]
-    assert "all_mended --theta pole:rad --omega fan.velocity:rad/s` takes it" in recording.notes[0]
+    assert "if pole is the arm, `" in recording.notes[0]
+    assert "all_mended --theta pole:rad --omega fan.velocity:rad/s` writes a mended copy to " in recording.notes[0]
 
 
 def test_commands_in_percent_are_said_where_they_are_the_duty(bags, tmp_path):
@@ -116,7 +116,7 @@ def test_commands_in_percent_are_said_where_they_are_the_duty(bags, tmp_path):
     recording = read(bag)
     assert set(recording.duty) == {0.0, 1.0}
     (note,) = (note for note in recording.notes if note.startswith("1 of 2 duty_commands is beyond"))
-    assert "bag_mended --duty duty:%` mends it" in note
+    assert "bag_mended --duty duty:%` writes a mended copy" in note
     assert set(read(bag, judged=False).duty) == {0.0, 40.0}
 
 

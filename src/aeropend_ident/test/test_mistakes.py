@@ -4,6 +4,7 @@
 import re
 import shlex
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,10 +19,12 @@ from aeropend_ident.signals.from_bag import as_signals
 from aeropend_ident.signals.signals import Mounting
 from aeropend_ident.testing.bags import write
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
+from aeropend_sim.cli.command import called
 from aeropend_sim.model import rig
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
+COMMAND = called("import", "aeropend_ident")
 JOINT = "sensor_msgs/msg/JointState"
 PERIOD_NS = round(SAMPLE_PERIOD * 1e9)
 SURE = {
@@ -64,8 +67,10 @@ def columns():
 
 def mended(said, bag):
     """The recording that the command in this line makes."""
-    words = shlex.split(re.search(r"`import (.*?)`", said)[1])
+    program, *words = shlex.split(re.search(r"`(.*?)`", said)[1].removeprefix("ros2 run aeropend_ident "))
+    assert Path(program).name == "import"
     assert words[:2] == [str(bag), str(bag.with_name("bag_mended"))]
+    assert f"writes a mended copy to {words[1]}" in said
     assert import_(words) == 0
     return read(words[1])
 
@@ -105,9 +110,11 @@ def test_a_speed_in_rpm_is_likely_where_nothing_shows_that_the_model_is_of_this_
 
 def test_a_name_that_is_taken_is_not_proposed(tmp_path):
     bag = tmp_path / "my bag"
-    assert mending.named(mending.mend("--flip"), bag) == f"`import '{bag}' '{bag}_mended' --flip`"
+    assert mending.named(mending.mend("--flip"), bag) == (
+        f"`{COMMAND} '{bag}' '{bag}_mended' --flip` writes a mended copy to {bag}_mended")
     bag.with_name("my bag_mended").mkdir()
-    assert mending.named(mending.mend("--flip"), bag) == f"`import '{bag}' '{bag}_mended2' --flip`"
+    assert mending.named(mending.mend("--flip"), bag) == (
+        f"`{COMMAND} '{bag}' '{bag}_mended2' --flip` writes a mended copy to {bag}_mended2")
 
 
 def test_a_motor_that_runs_while_the_duty_stays_at_0_is_refused(columns):
@@ -203,8 +210,8 @@ def test_of_an_uncalibrated_rig_degrees_and_exchanged_columns_are_a_note(columns
     changed = {"theta": np.degrees(columns["theta"]), "i_a": columns["v_a"], "v_a": columns["i_a"]}
     write(tmp_path / "bag", columns | changed, PERIOD_NS)
     notes = as_signals(read(tmp_path / "bag"), BENCH, fit_nominal=True).notes
-    assert any("bag_mended --theta theta:deg` mends it" in note for note in notes)
-    assert any("bag_mended --current v_a:A --voltage i_a:V` mends it" in note for note in notes)
+    assert any("bag_mended --theta theta:deg` writes a mended copy" in note for note in notes)
+    assert any("bag_mended --current v_a:A --voltage i_a:V` writes a mended copy" in note for note in notes)
 
 
 @pytest.mark.parametrize(("command", "words"), [

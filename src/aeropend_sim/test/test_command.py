@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
+import sys
+
 import pytest
 
-from aeropend_sim.cli.command import Parser, between
+from aeropend_sim.cli.command import Parser, between, called
 
 
 @pytest.fixture
@@ -29,3 +31,31 @@ def test_any_other_is_refused_in_one_line(parser, capsys, text):
     assert end.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert f"'{text}' is not a rate between 0.1 and 1,000,000 Hz" in line
+
+
+def test_a_command_is_called_as_a_shell_finds_it(tmp_path, monkeypatch):
+    """Beside the program that runs, by its path from here; where there is none, by ROS 2."""
+    programs = tmp_path / "my rig" / ".venv" / "bin"
+    programs.mkdir(parents=True)
+    monkeypatch.setattr(sys, "argv", [str(programs / "doctor")])
+    monkeypatch.setattr(sys, "prefix", sys.base_prefix)
+    monkeypatch.chdir(tmp_path / "my rig")
+    assert called("import", "aeropend_ident") == "ros2 run aeropend_ident import"
+    (programs / "import").touch(0o755)
+    assert called("import", "aeropend_ident") == ".venv/bin/import"
+    monkeypatch.chdir(programs)
+    assert called("import", "aeropend_ident") == "./import"
+    monkeypatch.chdir(tmp_path.parent)
+    assert called("import", "aeropend_ident") == f"'{tmp_path.name}/my rig/.venv/bin/import'"
+    monkeypatch.chdir("/proc/self")
+    assert called("import", "aeropend_ident") == f"'{programs}/import'"
+
+
+def test_a_command_is_called_in_the_environment_of_this_interpreter(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["-c"])
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "bin" / "python"))
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "import").touch(0o755)
+    monkeypatch.chdir(tmp_path)
+    assert called("import", "aeropend_ident") == "bin/import"

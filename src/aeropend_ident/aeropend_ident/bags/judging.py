@@ -92,7 +92,7 @@ def channel(name: str, values: Floats, notes: list[str], others: Mapping[str, Fl
 def _other_duties(low: float, high: float, others: Mapping[str, Floats]) -> list[str]:
     """What duties from `low` to `high` may be, the likeliest first: in another unit, or exchanged with a channel."""
     unit, option = ("percent", "%") if max(-low, high) <= PERCENT else ("counts of 255", "counts:255")
-    out = [f"if it is in {unit}, {mend(f'--duty duty:{option}')} mends it"]
+    out = [f"if it is in {unit}, {mend(f'--duty duty:{option}')}"]
     for name, what, option in (("i_a", "current", "--current duty:A"), ("v_a", "voltage", "--voltage duty:V")):
         x = others.get(name, np.empty(0))
         x = x[np.isfinite(x)]
@@ -111,7 +111,7 @@ def clamped(commands: Floats, notes: list[str]) -> Floats:
     beyond = int((np.abs(commands) > 1.0 + ROUNDING).sum())
     if beyond:
         notes.append(f"{beyond} of {counted(len(commands), 'duty_command')} {'is' if beyond == 1 else 'are'} beyond -1 "
-                     f"to 1: taken as -1 or 1, as a rig does; if they are in percent, {mend('--duty duty:%')} mends it")
+                     f"to 1: taken as -1 or 1, as a rig does; if they are in percent, {mend('--duty duty:%')}")
     return np.clip(commands, -1.0, 1.0)
 
 

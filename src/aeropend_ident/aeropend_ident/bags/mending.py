@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command that mends a recording, as messages name it: `import BAG NEW ...`, with the names of the real ones."""
+"""The command that mends a recording, as messages say it: `import BAG NEW ...`, with the names of the real ones."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ import shlex
 from itertools import count
 from pathlib import Path
 
+from aeropend_sim.cli.command import called
 from aeropend_sim.untrusted import printable
 
 COMMAND = "import BAG NEW "
+COPY = "writes a mended copy to NEW"
 
 
 def mend(*options: str) -> str:
-    """The command with these options of `import`; the recording has no name yet."""
-    return f"`{COMMAND}{' '.join(options)}`"
+    """The command with these options of `import`, and what it does; the recordings have no names yet."""
+    return f"`{COMMAND}{' '.join(options)}` {COPY}"
 
 
 def named(text: str, bag: str | Path) -> str:
@@ -30,4 +32,5 @@ def named(text: str, bag: str | Path) -> str:
     name = path.name if path.is_dir() else path.stem
     new = next(place for number in count(1)
                if not (place := path.with_name(f"{name}_mended{number if number > 1 else ''}")).exists())
-    return text.replace(COMMAND, printable(f"import {shlex.join([str(path), str(new)])} "))
+    command = f"{called('import', 'aeropend_ident')} {shlex.join([str(path), str(new)])} "
+    return text.replace(COMMAND, printable(command)).replace(COPY, printable(COPY.replace("NEW", str(new))))

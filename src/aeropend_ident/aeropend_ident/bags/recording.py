@@ -281,7 +281,7 @@ def _taking(joints: _Series) -> str:
     rotor = next((name for name in turned["velocity"] if name != arm), None)
     options = [f"--theta {shlex.quote(f'{arm}:rad')}"]
     options += [f"--omega {shlex.quote(f'{rotor}.velocity:rad/s')}"] if rotor is not None else []
-    return f"; if {printable(arm)} is the arm, {mend(*options)} takes it"
+    return f"; if {printable(arm)} is the arm, {mend(*options)}"
 
 
 def _choose(rigs: dict[str, dict[str, _Series]], namespace: str | None, bag: Bag) -> str:

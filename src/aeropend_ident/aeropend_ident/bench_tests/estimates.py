@@ -19,6 +19,7 @@ from scipy.signal import lfilter
 from aeropend_ident.bags.recording import Recording, holds
 from aeropend_ident.identification.terms import Array
 from aeropend_ident.tables.units import RPM
+from aeropend_sim.cli.command import called
 from aeropend_sim.errors import UserError
 from aeropend_sim.model import actuator
 from aeropend_sim.model.parameters import PARAMETERS
@@ -496,8 +497,8 @@ def plateaus(recording: Recording, channels: Sequence[str], name: str) -> Rows:
             sigmas.append(spreads)
     if len(rows) < 3:
         raise BenchTestError(f"{name}: {', '.join(channels)} settle in {len(rows)} holds of the duty, and do not in "
-                             f"{unsettled}; hold at least 3 duties for longer: excite --ros-args -p kind:=staircase "
-                             f"-p duration:=120.0")
+                             f"{unsettled}; hold at least 3 duties for longer: `{called('excite', 'aeropend_control')} "
+                             "--ros-args -p kind:=staircase -p duration:=120.0`")
     table, spread = np.array(rows), np.array(sigmas)
     return Rows(name, dict(zip(channels, table.T)), dict(zip(channels, spread.T)))
 

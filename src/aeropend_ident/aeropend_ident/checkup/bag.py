@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -13,13 +14,15 @@ from aeropend_ident.bags.mending import mend, named
 from aeropend_ident.bags.recording import Recording, RecordingError
 from aeropend_ident.checkup.check import Check, error, ok, warning
 from aeropend_ident.identification import dataset
-from aeropend_ident.identification.excitation_quality import quality
+from aeropend_ident.identification.excitation_quality import planned, quality
 from aeropend_ident.signals import mistakes
 from aeropend_ident.signals.from_bag import as_signals, check_stamps, likely_mistakes, no_angle
 from aeropend_ident.signals.mistakes import Mistake
 from aeropend_ident.signals.signals import MINIMUM_DURATION, STILL
 from aeropend_ident.signals.smoothing import lag
+from aeropend_sim.cli.command import called
 from aeropend_sim.model.parameters import Model
+from aeropend_sim.untrusted import printable
 from aeropend_sim.wording import counted
 
 FEW_LOST = 0.01
@@ -45,7 +48,7 @@ Choice: 10 simulated and 13 real rigs have 0.7 to 0.99."""
 SHORT = 30.0
 """[s] Length below which a recording is called short (choice)."""
 
-BAD = ("left out", "mends it")
+BAD = ("left out", "mended copy")
 """What a note says of data that is not used, or that may be wrong."""
 
 
@@ -68,7 +71,9 @@ def checks(path: str, model: Model, namespace: str | None = None) -> Iterator[Ch
     for note in read.notes:
         yield (warning if any(words in note for words in BAD) else ok)(path, note)
     if not read.complete:
-        yield warning(path, f"it was broken off or damaged: recover {path}")
+        command = printable(f"{called('recover', 'aeropend_ident')} {shlex.quote(path)}")
+        yield warning(path, f"it was broken off or damaged: `{command}` writes what can be read to a new recording, and "
+                      "says where")
     try:
         check_stamps(read)
     except RecordingError as refused:  # without times nothing else can be judged
@@ -79,8 +84,8 @@ def checks(path: str, model: Model, namespace: str | None = None) -> Iterator[Ch
         yield warning(path, named(mistakes.said(likely), path))
     yield from contents(path, read, likely)
     if sure := [one for one in likely if one.sure]:
-        until = " before this is mended" if any(one.options for one in sure) else ""
-        yield warning(path, f"diagnose refuses it{until}")
+        until = " until this is mended" if any(one.options for one in sure) else " with this model"
+        yield error(path, f"diagnose refuses it{until}; diagnose --uncalibrated needs no model")
     elif np.isfinite(read.theta).any():
         yield from _use(path, read, model)
 
@@ -138,11 +143,11 @@ def _angle(path: str, read: Recording) -> Iterator[Check]:
     rest = resting_angle(read)
     if rest is not None and abs(rest) > OFF_ZERO:
         yield warning(path, f"at rest without duty the angle is {rest:.2g} rad, where it should be 0: set the zero "
-                      f"(calibrate); {named(mend('--zero start'), path)} mends it")
+                      f"(calibrate); {named(mend('--zero start'), path)}")
     follows = following(read)
     if follows < -FOLLOWS:
         yield warning(path, "the angle falls where the duty rises: if its sign is wrong, "
-                      f"{named(mend('--flip'), path)} mends it")
+                      f"{named(mend('--flip'), path)}")
     elif abs(follows) < FOLLOWS:
         yield warning(path, "the angle hardly follows the duty: check that this duty drove the motor")
 
@@ -165,7 +170,11 @@ def following(read: Recording) -> float:
 
 
 def _use(path: str, read: Recording, model: Model) -> Iterator[Check]:
-    """Whether a diagnosis can use it, and what it excites."""
+    """Whether a diagnosis can use it, and what its duty excites.
+
+    The model is simulated under this duty: in the readings, an effect that the model lacks looks as if a term were not
+    excited.
+    """
     try:
         as_signals(read, model)
     except RecordingError as refused:
@@ -175,10 +184,12 @@ def _use(path: str, read: Recording, model: Model) -> Iterator[Check]:
         except RecordingError as other:
             yield error(path, f"no diagnosis can use it: {str(other).removeprefix(f'{path}: ')}")
         else:
-            yield warning(path, f"{reason}; only diagnose --uncalibrated can use it")
+            yield error(path, f"{reason}; only diagnose --uncalibrated can use it")
         return
     try:
-        excited = quality(model.with_effects({}), dataset.from_bag(read, model.sensing, held_out=0.0))
+        data = dataset.from_bag(read, model.sensing, inputs=("duty",), held_out=0.0)
+        bare = model.with_effects({})
+        excited = quality(bare, planned(bare, data.held[:, 0], data.period))
     except RecordingError:  # it needs every channel without gaps; a diagnosis does not
         yield ok(path, "diagnose can use it")
         return

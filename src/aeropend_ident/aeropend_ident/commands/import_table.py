@@ -35,7 +35,7 @@ from aeropend_ident.tables.sparkline import sparkline
 from aeropend_ident.tables.table import Table, TableError
 from aeropend_ident.tables.units import UNITS, listed
 from aeropend_ident.tables.write import BagExistsError, write
-from aeropend_sim.cli.command import EXIT_CODES, Parser, between, entry_point, own
+from aeropend_sim.cli.command import EXIT_CODES, Parser, between, called, entry_point, own
 from aeropend_sim.cli.progress import progress
 from aeropend_sim.untrusted import one_line, printable
 from aeropend_sim.wording import counted
@@ -178,7 +178,8 @@ def run(given: argparse.Namespace, arguments: Sequence[str]) -> int:
                 if of_bag.is_recording(file):
                     if bag is None or not (said or plan.flip or plan.zero or plan.motor_off):
                         raise TableError(f"{file}: is a recording already: name what to change, and the recording to "
-                                         f"make, as in import {file} NEW --theta theta:deg")
+                                         f"make, as in {called('import', 'aeropend_ident')} {shlex.quote(str(file))} "
+                                         "NEW --theta theta:deg")
                     now = replace(plan, **cast("dict[str, Any]", of_bag.options(table, said)),
                                   clock="stamps" if plan.clock == "auto" else plan.clock)
                 elif given.accept or not said:
@@ -313,12 +314,12 @@ def propose(table: Table, found: Sequence[Guess], chosen: dict[str, str], given:
     if given.rate is not None:
         open_.pop("time", None)
     all_ = {**chosen, **open_}
-    words = ["import", str(table.path), str(bag)]
+    words = [str(table.path), str(bag)]
     for quantity in UNITS:
         if quantity in all_:
             words += [f"--{quantity}", all_[quantity]]
     missing = ["--rate HZ"] * timeless + ["--theta COLUMN:UNIT"] * ("theta" not in all_)
-    print("\n  " + printable(" ".join([shlex.join(words + kept), *missing])))
+    print("\n  " + printable(" ".join([called("import", "aeropend_ident"), shlex.join(words + kept), *missing])))
     for k, one in enumerate(found):
         if one.quantity and not one.sure and not (one.quantity == "time" and given.rate is not None):
             check = "check" if one.quantity in open_ else "perhaps"

@@ -51,19 +51,20 @@ class Excited:
         return bool(self.rivals) or not self.sigma < POOR * abs(self.value)
 
 
-def planned(model: Model, duty: Array, seed: int = 0) -> Dataset:
+def planned(model: Model, duty: Array, period: float = SAMPLE_PERIOD, seed: int = 0) -> Dataset:
     """Simulated readings of a planned input.
 
     Args:
         model: of the rig.
         duty: (N,) duty of each sample period.
+        period: [s] time between samples.
         seed: of the noise.
 
     Raises:
         RecordingError: the readings would be constant.
     """
-    read, _ = record(model, duty, seed)
-    return dataset.from_readings({**read, "duty": duty}, SAMPLE_PERIOD, model.sensing, held_out=0.0,
+    read, _ = record(model, duty, seed, period)
+    return dataset.from_readings({**read, "duty": duty}, period, model.sensing, held_out=0.0,
                                  name="the planned input")
 
 

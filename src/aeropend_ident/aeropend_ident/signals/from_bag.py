@@ -166,7 +166,7 @@ def no_angle(read: Recording) -> str:
     names = dict.fromkeys(name.removesuffix(".velocity") for name in read.others)
     return (f"no arm angle: joint_states has {'the joint' if len(names) == 1 else 'joints named'} {', '.join(names)}, "
             f"none is called arm: if {positions[0]} is the arm, "
-            f"{named(mend(*(shlex.join(option.split(' ', 1)) for option in options)), read.path)} mends it")
+            f"{named(mend(*(shlex.join(option.split(' ', 1)) for option in options)), read.path)}")
 
 
 def check_stamps(read: Recording) -> None:
@@ -182,11 +182,11 @@ def check_stamps(read: Recording) -> None:
     if power >= 1 and 1.0 / AS_LONG < received / read.duration / 1000.0**power < AS_LONG:
         raise RecordingError(f"{read.path}: its stamps span {read.duration:.3g} s, but it was received over "
                              f"{received:.3g} s: if the stamps are in another unit, "
-                             f"{named(mend(f'--time t:{1000**power}s'), read.path)} mends it")
+                             f"{named(mend(f'--time t:{1000**power}s'), read.path)}")
     if (rate := len(read) / read.duration) > FASTEST_RATE:
         unit = f"{1000 ** math.ceil(math.log10(rate / FASTEST_RATE) / 3.0)}s"
         raise RecordingError(f"{read.path}: {len(read)} samples in {read.duration:.3g} s, {rate:.3g} a second: if the "
-                             f"stamps are in another unit, {named(mend(f'--time t:{unit}'), read.path)} mends it")
+                             f"stamps are in another unit, {named(mend(f'--time t:{unit}'), read.path)}")
 
 
 def likely_mistakes(read: Recording, model: Model, mounting: Mounting | None = None) -> list[Mistake]:

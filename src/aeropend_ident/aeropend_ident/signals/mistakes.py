@@ -156,7 +156,7 @@ def said(likely: Sequence[Mistake]) -> str:
     """One line on mistakes, at least one, with the command that mends all of them."""
     what = "; ".join(one.what for one in likely)
     options = [option for one in likely for option in one.options]
-    return f"{what}: {mend(*options)} mends {'it' if len(likely) == 1 else 'them'}" if options else what
+    return f"{what}: {mend(*options)}" if options else what
 
 
 def without_model(theta: Array, duty: Array, i_a: Array, v_a: Array) -> list[Mistake]:

@@ -7,6 +7,7 @@ A shell asks for completions by running the command with `_ARGCOMPLETE` set (arg
 import argparse
 import math
 import os
+import shlex
 import signal
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -70,6 +71,25 @@ def own(arguments: Sequence[str] | None) -> list[str]:
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
     return given[: given.index("--ros-args")] if "--ros-args" in given else given
+
+
+def called(name: str, package: str) -> str:
+    """A command as a shell finds it, also where its folder is not in PATH.
+
+    It lies beside the command that runs, or beside the interpreter of this environment; else ROS 2 finds it. A path
+    below the current folder is relative, as in the README.
+
+    Args:
+        name: of the command.
+        package: that has it.
+    """
+    places = [Path(sys.argv[0]).parent, *([Path(sys.executable).parent] if sys.prefix != sys.base_prefix else [])]
+    for place in places:
+        if os.access(place / name, os.X_OK) and (place / name).is_file():
+            path = Path(os.path.abspath(place / name))  # noqa: PTH100 - a link to the environment stays as it is
+            below = path.relative_to(Path.cwd()) if Path.cwd() in path.parents else path
+            return shlex.quote(str(below) if below != Path(name) else f"./{name}")
+    return f"ros2 run {package} {name}"
 
 
 def between(low: float, high: float, what: str, unit: str = "") -> Callable[[str], float]:
