@@ -72,7 +72,7 @@ def checks(path: str, model: Model, namespace: str | None = None) -> Iterator[Ch
         yield (warning if any(words in note for words in BAD) else ok)(path, note)
     if not read.complete:
         command = printable(f"{called('recover', 'aeropend_ident')} {shlex.quote(path)}")
-        yield warning(path, f"it was broken off or damaged: `{command}` writes what can be read to a new recording, and "
+        yield warning(path, f"it was broken off or damaged: `{command}` writes what can be read to a new recording and "
                       "says where")
     try:
         check_stamps(read)
