@@ -50,30 +50,20 @@ def run(command: str, seed: int, folder: Path, files: Path, patience: float) -> 
     story: list[str] = []
     faults: list[str] = []
     end = time.monotonic() + patience
-    with suppress(EOFError):  # it died
+    with suppress(EOFError):  # it has ended
         while there.poll(max(end - time.monotonic(), 0.0)):
             what, value = there.recv()
             if what == "case":
                 words, story = value
-            elif what == "fault":
-                faults.append(value)
             else:
-                break
-        else:
-            faults.append(f"it did not end in {patience:g} s")
-            process.kill()
-    if command == "replay" and not faults:
-        process.join(10.0)
-    process.join(max(end - time.monotonic(), 1.0))
-    if process.is_alive():
+                faults.append(value)
         faults.append(f"it did not end in {patience:g} s")
         process.kill()
-        process.join()
-    code = process.exitcode
-    if code is not None and code < 0 and not faults:
+    process.join()
+    code = process.exitcode or 0
+    if code < 0 and not faults:
         faults.append(f"it was ended by {signal.Signals(-code).name}")
-    outcome = Outcome(0 if code is None else code, _text(folder / ".stdout"), _text(folder / ".stderr"), faults)
-    return outcome, words, story
+    return Outcome(code, _text(folder / ".stdout"), _text(folder / ".stderr"), faults), words, story
 
 
 def _child(pipe: Connection, command: str, seed: int, folder: Path, files: Path) -> None:
@@ -108,7 +98,6 @@ def _child(pipe: Connection, command: str, seed: int, folder: Path, files: Path)
     with suppress(Exception):
         sys.stdout.flush()
         sys.stderr.flush()
-    pipe.send(("end", None))
     os._exit(code)
 
 

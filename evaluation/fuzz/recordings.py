@@ -115,7 +115,8 @@ def recorded(draw: Draw, longest: float, mild: bool) -> Content:
     n, seed, kind = max(round(min(duration, longest) / fine), 1), int(draw.rng.integers(10**6)), draw.pick(*KINDS)
     effects = [str(id_) for id_ in draw.rng.permutation([id_ for id_ in CATALOGUE if id_ != "parameter_mismatch"])]
     effects = effects[: draw.pick(0, 0, 1, 1, 2)]
-    model = drawn_rig(seed, {id_: {} for id_ in effects}, off=draw.pick(0.0, 0.02, 0.02, 0.1, 0.3))
+    # off by more, a parameter may be negative
+    model = drawn_rig(seed, {id_: {} for id_ in effects}, off=draw.pick(0.0, 0.02, 0.02, 0.1, 0.2))
     if kind == "both ways":
         model = Model(model.name, {**model.model, "reverse": 1.0}, model.sensing, model.effects)
     duty = drive(draw, kind, n, fine, seed)
