@@ -215,6 +215,7 @@ class Command:
         longest: [s] length of recordings.
         references: share of recordings with references.
         several: share of runs with three recordings.
+        kinds: of experiments.
         first: arguments of a first run, which loads what is compiled, so that each case need not; None: no such run.
     """
 
@@ -224,6 +225,7 @@ class Command:
     longest: float = 40.0
     references: float = 0.35
     several: float = 0.0
+    kinds: tuple[str, ...] = recordings.KINDS
     first: tuple[str, ...] | None = None
 
     def load(self, files: Path) -> None:
@@ -251,7 +253,8 @@ COMMANDS = {
                         first=("--method", "weak", "--terms", "sin(theta),omega,v_a", "--out", "{files}/found")),
     "replay": Command("aeropend_ident.nodes.replay", replay),
     "step_response": Command(f"{_COMMANDS}.step_response", step_response, references=0.9, longest=400.0),
-    "bench_test": Command(f"{_COMMANDS}.bench", bench_test, mildness=0.65, several=0.4),
+    "bench_test": Command(f"{_COMMANDS}.bench", bench_test, mildness=0.65, several=0.4, longest=120.0,
+                          kinds=("staircase", "staircase", "steps", "constant", "free decay")),
     "recover": Command(f"{_COMMANDS}.recover", recover),
     "excitation_quality": Command(f"{_COMMANDS}.excitation_quality", excitation_quality, mildness=0.65,
                                   first=()),

@@ -104,11 +104,11 @@ def _child(pipe: Connection, command: str, seed: int, folder: Path, files: Path)
 def draw(command: str, seed: int, files: Path) -> tuple[list[str], list[str]]:
     """The arguments of a case and what its recordings hold; the recordings are written into this folder."""
     chance, of = Draw(seed, len(command)), COMMANDS[command]
-    longest = of.longest if chance.chance(0.1) else min(of.longest, 40.0)
+    longest = of.longest if chance.chance(0.2) else min(of.longest, 40.0)
     bags, story = [], []
     for number in range(3 if chance.chance(of.several) else 1):
         bags.append(Path(f"bag{number}"))
-        story += recordings.write(chance, bags[-1], longest, of.mildness, of.references)
+        story += recordings.write(chance, bags[-1], longest, of.mildness, of.references, of.kinds)
     return of.words(chance, bags, files), story
 
 

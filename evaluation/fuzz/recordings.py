@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -40,6 +40,8 @@ NAMES = [["arm", "rotor"], ["rotor", "arm"], ["arm"], ["rotor"], [], ["Arm", "Ro
          ["a\x1b[2Jb"]]
 ARRAYS = [[], [0.3], [0.3, math.nan], [math.nan, 0.3], [0.1] * 3, [0.2] * 17, [math.nan, math.nan], [math.inf],
           [1e300, -40.0], [0.1, 0.2]]
+KINDS = ("steps", "steps", "steps", "latin_hypercube", "staircase", "multisine", "free decay", "constant", "both ways",
+         "ramp", "binary")
 
 
 @dataclass
@@ -99,20 +101,16 @@ def drive(draw: Draw, kind: str, n: int, period: float, seed: int) -> NDArray[np
     return np.pad(duty[:n], (0, max(n - len(duty), 0)))
 
 
-KINDS = ("steps", "steps", "steps", "latin_hypercube", "staircase", "multisine", "free decay", "constant", "both ways",
-         "ramp", "binary")
-
-
-def recorded(draw: Draw, longest: float, mild: bool) -> Content:
+def recorded(draw: Draw, longest: float, mild: bool, kinds: Sequence[str] = KINDS) -> Content:
     """A recording as a rig makes it; if mild, one with the length and the rate that commands ask for."""
     rate = draw.pick(490.2, 490.2, 490.2, 20.0, 50.0, 100.0, 200.0, 1000.0)
-    duration = draw.pick(6.0, 8.0, 10.0, 15.0, 20.0, 30.0)
+    duration = draw.pick(6.0, 8.0, 10.0, 15.0, 20.0, 30.0, 30.0 if longest <= 40.0 else 60.0)
     if not mild:
         rate = draw.pick(rate, rate, 5.0, 10.0, 33.3, 250.0)
         duration = draw.pick(0.0, 0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 12.0, 40.0, 60.0, 372.0 if rate <= 20.0 else 6.0)
     fine = 0.00204 if rate < 600.0 else 0.001  # the rig is simulated at this period, and samples are left out
     every = max(round(1.0 / rate / fine), 1)
-    n, seed, kind = max(round(min(duration, longest) / fine), 1), int(draw.rng.integers(10**6)), draw.pick(*KINDS)
+    n, seed, kind = max(round(min(duration, longest) / fine), 1), int(draw.rng.integers(10**6)), draw.pick(*kinds)
     effects = [str(id_) for id_ in draw.rng.permutation([id_ for id_ in CATALOGUE if id_ != "parameter_mismatch"])]
     effects = effects[: draw.pick(0, 0, 1, 1, 2)]
     # off by more, a parameter may be negative
@@ -394,7 +392,8 @@ def change(draw: Draw, content: Content, mild: bool) -> None:
 # ---- the bag ---------------------------------------------------------------------------------------------------------
 
 
-def write(draw: Draw, path: Path, longest: float, mildness: float, references: float) -> list[str]:
+def write(draw: Draw, path: Path, longest: float, mildness: float, references: float,
+          kinds: Sequence[str] = KINDS) -> list[str]:
     """Write a recording; returns what it holds.
 
     Args:
@@ -403,9 +402,10 @@ def write(draw: Draw, path: Path, longest: float, mildness: float, references: f
         longest: [s]
         mildness: share of recordings that commands can often use.
         references: share of recordings with references.
+        kinds: of experiments.
     """
     mild = draw.chance(mildness)
-    content = recorded(draw, longest, mild)
+    content = recorded(draw, longest, mild, kinds)
     n, duty = content.n, content.columns["duty"]
     if n and draw.chance(0.5):
         content.commands = [(int(row), float(duty[row])) for row in np.flatnonzero(np.diff(duty, prepend=-1.0))]
