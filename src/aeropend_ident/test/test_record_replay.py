@@ -488,7 +488,7 @@ def test_record_refuses(processes, arguments, message):
         (["bag", "--ros-args", "-p", "namespace:=rig3"], "no topic in namespace /rig3; it holds /armature, /duty"),
         (["bag", "--ros-args", "-p", "start:=5.0"], "start is 5 s, but it lasts 0.0"),
         (["bag", "--ros-args", "-p", "rate:=0.0"], "parameter rate is 0: give 0.001 to 1000"),
-        (["empty"], "empty: no topic"),
+        (["empty"], "empty: holds no messages to replay"),
         (["rigs", "--ros-args", "-r", "__ns:=/x"], "several recorded topics would become /x/"),
         (["strange", "--ros-args", "-p", "topics:=strange"], "/strange cannot be replayed: message type no_msgs"),
         (["late", "--ros-args", "-p", "clock:=10.0"], "late: was received beyond 2038, which /clock"),

@@ -254,10 +254,11 @@ def _rigs(series: dict[tuple[str, str], _Series], bag: Bag, *, others: bool
         raise RecordingError(f"{bag.path}: {named(said, bag.path)}")
     if not bag.counts.total():
         why = f" ({bag.problems[0]})" if bag.problems else ""
-        raise RecordingError(f"{bag.path}: holds no messages{why}")
+        raise RecordingError(f"{bag.path}: holds no messages{why}: record again while plant or bridge runs")
     there = [f"{topic} ({msgtype}, {count})" for (topic, msgtype), count in sorted(bag.counts.items())]
     listed = ", ".join(there[:8]) + (f" and {len(there) - 8} more" if len(there) > 8 else "")
-    raise RecordingError(f"{bag.path}: no message of joint_states or armature in it; it holds {listed}")
+    raise RecordingError(f"{bag.path}: no message of joint_states or armature in it; it holds {listed}: "
+                         "record those of the rig too, or name the rig's topics so (--ros-args -r)")
 
 
 def _other_joints(joints: _Series) -> list[str] | None:
@@ -325,7 +326,8 @@ class _Join:
                 notes.append(f"{counted(alone, 'sample')} of armature {_has(alone)} no joint_states of the same stamp")
         self.stamps = np.union1d(joints.stamps, armature.stamps)
         if not len(self.stamps):
-            raise RecordingError(f"no sample could be read: {'; '.join(notes)}")
+            raise RecordingError(f"no sample could be read: {'; '.join(notes)}; correct the program that publishes "
+                                 "them, and record again")
         self.received = np.zeros(len(self.stamps), dtype=np.int64)
         for table in (armature, joints):  # where both are there, the arrival of joint_states counts
             self.received[np.searchsorted(self.stamps, table.stamps)] = table.received

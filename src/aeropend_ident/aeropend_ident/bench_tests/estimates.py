@@ -255,7 +255,7 @@ def blocked_recording(recording: Recording, name: str) -> Found:
     v, i, t = recording.v_a, recording.i_a, recording.t
     for channel in ("v_a", "i_a"):
         if channel not in recording.channels:
-            raise BenchTestError(f"{name}: {channel} was not measured")
+            raise BenchTestError(f"{name}: {channel} was not measured: record it too (armature)")
     if "omega" in recording.channels and np.nanmax(np.abs(recording.omega)) > 0.0:
         raise BenchTestError(f"{name}: the rotor turned, so v_a is not R_a i_a; block it, or use --steady")
     if len(recording.gaps) or not np.isfinite(np.column_stack([v, i])).all():
@@ -468,7 +468,7 @@ def plateaus(recording: Recording, channels: Sequence[str], name: str) -> Rows:
     """
     missing = [c for c in channels if c not in recording.channels]
     if missing:
-        raise BenchTestError(f"{name}: {', '.join(missing)} was not measured")
+        raise BenchTestError(f"{name}: {', '.join(missing)} was not measured: record it too")
     starts, sizes = holds(recording.duty)
     resolution = {c: _step(getattr(recording, c)) / math.sqrt(12.0) for c in channels}
     rows: list[list[float]] = []

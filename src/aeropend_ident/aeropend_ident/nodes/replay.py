@@ -116,10 +116,10 @@ class Plan:
             low, high = cells.get(received // PAUSE_NS, (received, received))
             cells[received // PAUSE_NS] = min(low, received), max(high, received)
         if last < 0:
-            raise RecordingError(f"{path}: holds no messages to replay")
+            raise RecordingError(f"{path}: holds no messages to replay: record again")
         self.start, self.end = first + round(start * 1e9), last
         if self.start > self.end:
-            raise RecordingError(f"{path}: start is {start:g} s, but it lasts {(last - first) / 1e9:.3f} s")
+            raise RecordingError(f"{path}: start is {start:g} s, but it lasts {(last - first) / 1e9:.3f} s: give less")
         self._first = first
         self.pauses = [(before, after) for (_, before), (after, _) in pairwise(cells[cell] for cell in sorted(cells))
                        if after - before > PAUSE_NS and before >= self.start]
@@ -169,6 +169,8 @@ class Plan:
         if self._namespace:
             places = {self._namespace.rstrip("/")}
             there = {key for key in there if key[0].startswith(f"{self._namespace.rstrip('/')}/")}
+        if not self.names:
+            raise RecordingError(f"{self.bag.path}: holds no messages to replay: record again")
         if not self._topics:
             chosen = there
         else:
@@ -185,7 +187,7 @@ class Plan:
 
     def _listed(self) -> str:
         topics = sorted({topic for topic, _ in self.names})
-        return f"; it holds {', '.join(topics)}" if topics else "; it holds no messages"
+        return f"; it holds {', '.join(topics)}: name one of these"
 
     def _in_order(self) -> Iterator[Event]:
         """Sort by receive time, over the distance that messages may be out of order."""

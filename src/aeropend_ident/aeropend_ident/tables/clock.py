@@ -155,7 +155,7 @@ def date(time: Floats, angle: Floats, lines: Ints, *, is_clock: bool = False, ti
     if len(rows) < len(time):
         notes.append(f"{counted(len(time) - len(rows), 'row')} without a time left out")
     if len(rows) < 3:
-        raise ClockError(f"{counted(len(rows), 'row')} with a time: too few for a recording")
+        raise ClockError(f"{counted(len(rows), 'row')} with a time: too few for a recording, which needs 3 or more")
     t, n = _unwrapped(time[rows], is_clock, tick)
     if n:
         notes.append(f"the clock restarts {n if n > 1 else 'once'}{' times' if n > 1 else ''}: counted on")

@@ -132,13 +132,13 @@ def samples(table: Table, plan: Plan) -> Samples:
     twice = [name for name, (k, _) in chosen.items() if [j for j, _ in chosen.values()].count(k) > 1]
     if twice:
         raise TableError(f"{table.path}: column {table.label(chosen[twice[0]][0])} is given as "
-                         f"{' and as '.join(twice)}")
+                         f"{' and as '.join(twice)}: give one of them another column, or leave it away")
     notes = list(table.notes)
     keep = _readable_rows(table, [k for k, _ in chosen.values()], plan, notes)
     columns = [table.columns[k] for k, _ in chosen.values()]
     for (k, _), column in zip(chosen.values(), columns):
         if not np.isfinite(column.values[keep]).any():
-            raise TableError(f"{table.path}: column {table.label(k)} holds no number")
+            raise TableError(f"{table.path}: column {table.label(k)} holds no number: give another column")
     dated = _date(table, plan, chosen, keep)
     notes += dated.notes
     values = {name: _placed(dated, keep, table.columns[k].values) for name, (k, _) in chosen.items()}
@@ -317,7 +317,8 @@ def _readable_rows(table: Table, used: list[int], plan: Plan, notes: list[str]) 
 
 def _date(table: Table, plan: Plan, chosen: dict[str, tuple[int, Unit]], keep: Ints) -> Dated:
     if len(keep) < 3:
-        raise TableError(f"{table.path}: {counted(len(keep), 'row')}: too few for a recording")
+        raise TableError(f"{table.path}: {counted(len(keep), 'row')}: too few for a recording, which needs 3 or "
+                         "more")
     if plan.time is None:
         assert plan.rate is not None
         full = clock.at_rate(len(table), plan.rate)
@@ -384,8 +385,9 @@ def _zero(table: Table, text: str, unit: Unit, read: Floats, dated: Dated) -> fl
         near = dated.time <= dated.time[0] + REST if text == "start" else dated.time >= dated.time[-1] - REST
         part = read[near & np.isfinite(read)]
         if not len(part):
-            raise TableError(f"{table.path}: --zero {text}: there is no angle in the "
-                             f"{'first' if text == 'start' else 'last'} {REST:g} s")
+            which = "first" if text == "start" else "last"
+            raise TableError(f"{table.path}: --zero {text}: there is no angle in the {which} {REST:g} s: give what is "
+                             "read when it hangs")
         moved = float(np.ptp(np.percentile(part, (2, 98))))
         if moved > STILL:
             which = "first" if text == "start" else "last"

@@ -228,7 +228,7 @@ def _dialect(path: Path, sample: Sequence[str], delimiter: str | None, decimal: 
     assert best is not None
     (share, _, _), found = best
     if share == 0.0 or (share < READABLE and found.width == 1):
-        raise TableError(f"{path}: no table of numbers is found in it")
+        raise TableError(f"{path}: no table of numbers is found in it: export the data as columns of numbers")
     return found
 
 
