@@ -156,10 +156,10 @@ def _check_alive(name: str, columns: Mapping[str, Array]) -> None:
     for column, x in columns.items():
         if np.ptp(x) == 0.0:
             raise RecordingError(f"{name}: {column} is {x[0]:g} all the time, so no equation with it can be "
-                                 "identified; record while `excite` runs, or leave it out (--states, --input)")
+                                 "identified; record while `excite` runs, or leave it out (identify --states, --input)")
         if np.std(x) < STANDS_OUT * float(noise_of(x)):
             raise RecordingError(f"{name}: {column} varies too little beside its noise, so no equation with it can be "
-                                 "identified; record while `excite` runs, or leave it out (--states, --input)")
+                                 "identified; record while `excite` runs, or leave it out (identify --states, --input)")
 
 
 def from_bag(read: Recording, sensing: Mapping[str, float], states: Sequence[str] = STATES,
@@ -285,7 +285,8 @@ def _check_channel(read: Recording, name: str) -> None:
     x = getattr(read, name)
     holes = int((~np.isfinite(x)).sum())
     if holes == len(x):
-        raise RecordingError(f"{read.path}: {name} was not measured; leave it out (--states, --input) or record it")
+        raise RecordingError(f"{read.path}: {name} was not measured; record it, or leave it out (identify --states, "
+                             "--input)")
     if holes:
         raise RecordingError(f"{read.path}: {name} is not a number in {holes} of {len(x)} samples; identification "
                              "needs a recording without holes")
