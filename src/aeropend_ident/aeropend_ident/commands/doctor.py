@@ -20,7 +20,7 @@ EXAMPLES = """examples:
   doctor monday tuesday rig.yaml         several recordings, and a model file
 
 An error is what does not work: a missing program, a file that cannot be read, a recording that diagnose would refuse
-with this model. A warning is what may be wrong: it does not change the exit code.
+with the same --model. A warning is what may be wrong: it does not change the exit code.
 
 exit codes: 0 no error, 2 an error (its line says what to do) or a wrong command line, 130 interrupted"""
 
