@@ -7,8 +7,9 @@ from sparse_data import TERMS, pushed_once
 from aeropend_ident.commands.identify import document, lines
 from aeropend_ident.identification.dataset import from_arrays
 from aeropend_ident.identification.identify import identify
-from aeropend_ident.identification.output_error import ReducedNormalEquations
-from aeropend_ident.identification.output_error_selection import QuadraticMisfit
+from aeropend_ident.identification.output_error import Fitter, ReducedNormalEquations
+from aeropend_ident.identification.output_error_selection import QuadraticMisfit, select_terms
+from aeropend_ident.identification.problem import Problem
 
 
 @pytest.mark.promise("Identification", "A term that the data do not determine is marked `undetermined`")
@@ -61,3 +62,13 @@ def test_terms_that_are_equal_but_for_rounding_cost_no_infinite_misfit():
     normal = ReducedNormalEquations(H, np.array([1.0, 0.0]), 1.0, 10, [])
     changes = list(QuadraticMisfit(normal, np.zeros(2), 1.0, np.zeros(2, int)).single_changes([0, 1]))
     assert all(np.isfinite(change.value) for change in changes)
+
+
+def test_a_model_that_runs_in_coarse_steps_only_is_none(monkeypatch):
+    """As a fast one that coarse steps damp: finer ones show that it diverges."""
+    data = pushed_once(0.02)
+    problem = Problem(data, TERMS)
+    start = problem.widened(np.where(np.array(TERMS) == "x", -1.0, 0.0)[None])
+    run = Fitter.run
+    monkeypatch.setattr(Fitter, "run", lambda fitter, model, x0: run(fitter, model, x0) if fitter.steps == 2 else None)
+    assert select_terms(problem.experiment(data.train), start, problem.candidates, 200, cut=False) is None

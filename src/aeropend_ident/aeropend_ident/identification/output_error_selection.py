@@ -247,7 +247,7 @@ def select_terms(experiment: Experiment, start: Array, candidates: Array, shot: 
         show: progress display, from 0 to 1.
 
     Returns:
-        None when the first model diverges.
+        None when the first model diverges, or the chosen one once it is integrated in finer steps.
     """
     every = Entries.candidates(candidates)
     fitter = _first_fit(experiment, start, every, shot, cut=cut)
@@ -258,7 +258,8 @@ def select_terms(experiment: Experiment, start: Array, candidates: Array, shot: 
     steps = fitter.steps
     fitter.refine_steps()
     if fitter.steps != steps:
-        fitter.fit()
+        if not fitter.fit():
+            return None
         improve_terms(fitter, every, start.shape)
     unstable: list[tuple[int, int, float]] = []
     if score is not None:
