@@ -34,6 +34,19 @@ def test_a_channel_that_is_not_used_may_be_missing():
     assert data.states == ("theta", "theta_dot")
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("states", "inputs"), [
+    (("i_a",), ("v_a",)), (("omega", "i_a"), ("duty",)), (("theta", "theta_dot"), ("omega",))])
+def test_channels_that_are_not_used_may_have_holes(states, inputs):
+    duty = steps(8.0, 3)
+    columns = {**rig.record(BENCH, duty, 3)[0], "duty": duty}
+    for name in {"theta", "omega", "i_a", "v_a"} - {*states, *inputs}:
+        columns[name][100:400] = np.nan
+    data = from_readings(columns, SAMPLE_PERIOD, BENCH.sensing, states, inputs)
+    assert np.isfinite(data.values).all()
+    assert np.isfinite(data.held).all()
+
+
 def test_stamps_that_keep_no_sample_period_are_refused_in_one_line():
     duty = steps(12.0, 3)
     columns = {**rig.record(BENCH, duty, 3)[0], "duty": duty}

@@ -237,17 +237,21 @@ def _from_signals(name: str, signals: Signals, columns: Mapping[str, Array], sen
     tau = sensing["angle_filter_tau"]
     noise = {"i_a": signals.sigma["i_a"], "theta": signals.sigma["theta"], "omega": signals.sigma["omega"]}
     coarse: dict[str, float] = {}
-    described: dict[str, Array] = {"i_a": columns["i_a"], "duty": signals.duty,
-                                   "v_a": _held_voltage(columns["v_a"], signals.duty, signals.sigma["v_a"], h)}
+    used = {*states, *inputs}  # what is not used may have holes
+    described: dict[str, Array] = {"i_a": columns["i_a"], "duty": signals.duty}
+    if "v_a" in used:
+        described["v_a"] = _held_voltage(columns["v_a"], signals.duty, signals.sigma["v_a"], h)
     outputs: list[tuple[str, Output]] = []
     means: list[tuple[str, Means]] = []
     sensor_states: list[SensorState] = []
-    smooth, rate = smoothed(columns["theta"], h)
-    left = float(np.std(columns["theta"] - smooth))
-    coarse["theta_dot"] = smoothness(columns["theta"])
-    noise["theta_dot"] = left / (h * max(coarse["theta_dot"], 1.0) ** 1.5)
-    late = np.arange(n) + 2.0 * tau / h  # two equal lags are, to first order, a delay of their sum
-    described |= {k: np.interp(late, np.arange(n), x) for k, x in (("theta", columns["theta"]), ("theta_dot", rate))}
+    if used & {"theta", "theta_dot"}:
+        smooth, rate = smoothed(columns["theta"], h)
+        left = float(np.std(columns["theta"] - smooth))
+        coarse["theta_dot"] = smoothness(columns["theta"])
+        noise["theta_dot"] = left / (h * max(coarse["theta_dot"], 1.0) ** 1.5)
+        late = np.arange(n) + 2.0 * tau / h  # two equal lags are, to first order, a delay of their sum
+        described |= {k: np.interp(late, np.arange(n), x)
+                      for k, x in (("theta", columns["theta"]), ("theta_dot", rate))}
     seen = "theta"
     if tau > 0.0 and "theta" in states:
         sensor_states += [
