@@ -3,9 +3,11 @@
 import xml.etree.ElementTree as ET
 
 import numpy as np
+import pytest
 
 from aeropend_ident.bench_tests.estimates import Panel
 from aeropend_ident.bench_tests.picture import scatter
+from aeropend_ident.identification import picture
 from aeropend_ident.identification.picture import draw
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -25,3 +27,8 @@ def test_each_panel_of_bench_tests_shows_its_readings_and_its_curve():
     drawn = ET.fromstring(scatter([Panel("load", "x", "y", x, 2.0 * x, lambda x: 2.0 * x)] * 3))
     assert len(drawn.findall(f"{SVG}g")) == 3
     assert len(drawn.findall(f".//{SVG}circle")) == 15
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_run_that_leaves_the_picture_far_is_drawn_at_its_edge():
+    assert picture._line(np.array([0.0, 1e300, -1e300]), 0.0, 1e-300, 0, 0, "red").count(",") == 3

@@ -58,7 +58,8 @@ def _strip(title: str, read: Array, model: Array, x: int, y: int) -> str:
 
 def _line(values: Array, low: float, high: float, x: int, y: int, colour: str) -> str:
     at = np.unique(np.linspace(0, len(values) - 1, POINTS).astype(int))
-    level = np.clip((values[at] - low) / (high - low), -0.05, 1.05)
+    span = high - low
+    level = (np.clip(values[at], low - 0.05 * span, high + 0.05 * span) - low) / span  # no overflow
     known = np.isfinite(level)
     across = x + at[known] / max(len(values) - 1, 1) * WIDTH
     points = " ".join(f"{a:.1f},{y + HEIGHT * (1.0 - b):.1f}" for a, b in zip(across, level[known]))
