@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from aeropend_ident.live import false_alarms
-from aeropend_ident.live.companion_model import Samples
+from aeropend_ident.live.bank import columns
+from aeropend_ident.live.companion_model import Companion, Samples
 from aeropend_ident.live.intake import Batch, Intake
 from aeropend_ident.live.watcher import PARTED, STALE, Watcher
+from aeropend_ident.nodes.topic_recorder import DEPTH
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
 from aeropend_sim.model.rig import Rig
@@ -135,6 +137,17 @@ def test_halves_are_joined_in_any_order_and_impossible_readings_are_counted():
     assert intake.odd == 3
 
 
+def test_no_sample_is_lost_when_one_topic_comes_long_before_the_other():
+    intake, stamps = Intake(), PERIOD_NS * np.arange(1, DEPTH + 1)
+    for stamp in stamps.tolist():
+        intake.joints(stamp, 0.3, 100.0)
+    for stamp in stamps.tolist():
+        intake.armature(stamp, 0.1, 0.5, 0.25)
+    (batch,) = intake.take()
+    assert np.array_equal(batch.stamps, stamps)
+    assert intake.lost == 0
+
+
 def test_readings_that_do_not_change_are_frozen():
     intake = Intake()
     for k in range(1, 400):
@@ -151,3 +164,21 @@ def test_readings_that_do_not_change_are_frozen():
 def test_the_limit_follows_from_the_mean_time_between_false_alarms():
     assert false_alarms.limit(48.0) > false_alarms.limit(24.0)
     assert false_alarms.mean_hours(false_alarms.limit(24.0)) == pytest.approx(24.0)
+
+
+def test_a_torque_that_is_missing_is_no_speed_of_an_arm_at_rest():
+    """What depends on the speed of the arm leaves nothing at rest, so that it cannot explain a torque that changes."""
+    bench = load("bench")
+    n = round(6.0 / SAMPLE_PERIOD)
+    heavier = Model("rig", {**bench.model, "mgd_over_J": 1.1 * bench.model["mgd_over_J"]}, bench.sensing, {})
+    duty = np.full(n, 0.35)
+    read, _ = Rig(heavier, seed=1).run(np.full(round(20.0 / SAMPLE_PERIOD), 0.35))
+    bank = columns(bench)
+    companion = Companion(bench, bank)
+    rows = companion.step(Samples(*read[:, -n:], duty)).rows["arm"]
+    still = rows[n // 2:].mean(axis=0)
+    moved = {c.effect: abs(still[0] - still[1 + k]) for k, c in enumerate(c for c in bank if "arm" in c.stages)}
+    assert abs(still[0]) > 3.0
+    for effect in ("axial_inflow", "encoder_lag", "quadratic_drag"):
+        assert moved[effect] < 0.02, effect
+    assert moved["cable_torque"] > 0.5

@@ -5,6 +5,11 @@ As in the diagnosis (docs/method.md, step 3), but causal, and for a few samples 
 voltage read. The arm is driven by the speed of the model plus the error of the last pulses, and follows the angle read
 through an observer, so that it forgets what is past. What the observer has not expected, the innovation, is the
 residual of the arm. Each column of the bank (`bank`) has a model of its own beside the nominal one.
+
+An observer whose model lacks a torque also gets a speed that is not there: at rest its correction of the angle and this
+speed cancel. Terms that depend on the speed of the arm would then follow the residual itself, and explain any. So the
+sensitivities of the arm are those around the motion that was measured: the observers of the columns, and a nominal one
+that they are compared with, get the torque that is missing, which a disturbance observer estimates.
 """
 
 from __future__ import annotations
@@ -34,6 +39,10 @@ would show."""
 
 OBSERVER_DAMPING = 0.7
 """Damping ratio of the observer (convention: fastest without overshoot that matters)."""
+
+DISTURBANCE = 0.3
+"""Gain of the disturbance observer over the cube of `OBSERVER_RATE` (derived: its three poles are then about equally
+fast, 0.57 to 0.73 of it, and well damped)."""
 
 TURNS = 256
 """Samples of the rotor's angle that are remembered (derived: the longest pulse interval, `sensing.SPEED_TIMEOUT`)."""
@@ -237,7 +246,7 @@ def _arm(theta: Array, speed: Array, gains: Array, stages: Array, states: Any, c
     Args:
         theta: (N,) [rad] angle read.
         speed: (N + 1,) [rad/s] speed of the rotor, the sample before first.
-        gains: (2,) of the observer: [1], [1/s].
+        gains: (3,) of the observer: [1], [1/s], and [1/s²] of its torque.
         stages: (M, 2) states of the angle's filter.
         states: of `_Members`.
         c: of `_Members`.
@@ -246,17 +255,20 @@ def _arm(theta: Array, speed: Array, gains: Array, stages: Array, states: Any, c
         chain: of `_Members`.
         added: of `_Members`.
         out: (N, M), filled with the innovations [rad].
+
+    The first member is without the missing torque, the second estimates it, and all others get it from there.
     """
     n, size = theta.shape[0], out.shape[1]
     for k in range(n):
+        torque = states[1].gust
         for j in range(size):
             s = states[j]
             before = s
             w = speed[k]
             rise = (speed[k + 1] - w) / c[j].steps
             for _ in range(c[j].steps):
-                now = dynamics.State(0.0, w, 0.0, s.theta, s.theta_dot, s.thrust, 0.0, s.flex, s.flex_dot, 0.0, s.time,
-                                     s.memory)
+                now = dynamics.State(0.0, w, 0.0, s.theta, s.theta_dot, s.thrust, 0.0, s.flex, s.flex_dot,
+                                     torque if j > 0 else 0.0, s.time, s.memory)
                 past = None if added is None else dynamics.pasts(now, 0.0, c[j], added)
                 m, f1 = dynamics.advance_arm(now, w + 0.5 * rise, w + rise, past, c[j], e[j], x[j], added)
                 w += rise
@@ -272,7 +284,8 @@ def _arm(theta: Array, speed: Array, gains: Array, stages: Array, states: Any, c
             if math.isnan(error):
                 error = 0.0
             states[j] = dynamics.State(0.0, s.omega, 0.0, s.theta + gains[0] * error, s.theta_dot + gains[1] * error,
-                                       s.thrust, 0.0, s.flex, s.flex_dot, 0.0, s.time, s.memory)
+                                       s.thrust, 0.0, s.flex, s.flex_dot, torque + gains[2] * error if j == 1 else 0.0,
+                                       s.time, s.memory)
             stages[j, 0], stages[j, 1] = first + gains[0] * error, second + gains[0] * error
 
 
@@ -310,7 +323,7 @@ class Companion:
         self._numbers = [m.numbers() for m in self._actuators]
         behind = [actuator.behind_terminals(m) for m in models["motor"]]
         self._motor = _Members(behind, period)
-        self._arm = _Members(models["arm"], period)
+        self._arm = _Members([model, *models["arm"]], period)
         self._chain = _Members([model], period)
         longest = max(m.effect("command_delay", "delay") for m in self._actuators)
         self._history = math.ceil(longest / period) + 2
@@ -319,7 +332,7 @@ class Companion:
         gravity, damping = model.numbers()["mgd_over_J"], model.numbers()["c_over_J"]
         rate = OBSERVER_RATE * math.sqrt(gravity / REFERENCE_GRAVITY)
         first = max(2.0 * OBSERVER_DAMPING * rate - damping, 0.0)
-        self._gains = np.array([first * period, max(rate * rate - gravity - damping * first, 0.0) * period])
+        self._gains = np.array([first, max(rate * rate - gravity - damping * first, 0.0), DISTURBANCE * rate**3]) * period
         self.floors = {**noises, "omega": max(model.sensing["speed_noise"], 1.0)}
         self.running = False
 
@@ -388,7 +401,7 @@ class Companion:
         a = self._arm
         _arm(samples.theta, np.concatenate([[self._last_speed], speed]), self._gains, self._stages, a.states, a.c, a.e,
              a.x, a.chain, a.added, out)
-        out /= self._noise[3]
+        innovation = (out[:, :1] + np.column_stack([np.zeros(n), out[:, 2:] - out[:, 1:2]])) / self._noise[3]
 
         said = np.empty((4, n))
         f = self._chain
@@ -396,7 +409,7 @@ class Companion:
         self._count += n
         self._last_off = float(off[-1])
         self._last_v, self._last_i, self._last_speed = float(v[-1]), float(i_a[-1]), float(speed[-1])
-        rows = {"actuator": _rows((v_rows, 0)), "motor": _rows((current, 1), (pulse, 2)), "arm": _rows((out, 3))}
+        rows = {"actuator": _rows((v_rows, 0)), "motor": _rows((current, 1), (pulse, 2)), "arm": _rows((innovation, 3))}
         return Residuals({k: r[0] for k, r in rows.items()}, {k: r[1] for k, r in rows.items()},
                          {k: r[2] for k, r in rows.items()}, spikes, pulses,
                          Samples(said[0], said[1], said[2], said[3], duty))

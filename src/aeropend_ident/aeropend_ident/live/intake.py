@@ -13,8 +13,11 @@ from aeropend_ident.live.companion_model import Samples
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 from aeropend_sim.readings import MOST, ROUNDING
 
-WAITING = 200
-"""Halves of samples that wait for the other half (choice: 0.2 s of both topics)."""
+WAITING = 5000
+"""Halves of samples that wait for the other half.
+
+Derived: the node reads one topic after the other, and the middleware holds so many messages of a topic while it stood
+still (`topic_recorder.DEPTH`)."""
 
 BRIDGED = 0.25
 """[s] Longest run of lost samples that the model runs through (choice: a fifth of a swing of the arm)."""

@@ -53,6 +53,9 @@ LOOK_S = 0.5
 SILENT_S = 0.5
 """[s] Time without a sample after which the rig counts as silent (choice: ten batches)."""
 
+SURE = 0.5
+"""Probability above which another effect than the one that was told is told (convention: more likely than not)."""
+
 TOPICS = {
     interface.JOINT_STATES: "sensor_msgs/msg/JointState",
     interface.ARMATURE: "sensor_msgs/msg/BatteryState",
@@ -113,7 +116,7 @@ class Watch(Node):
         self._children: list[subprocess.Popen[bytes]] = []
         self._samples = self._malformed = self._alarms = 0
         self._heard = -math.inf
-        self._crowded = ""
+        self._crowded = self._told = ""
         self._warned: dict[str, float] = {}
         self._clear = threading.Event()
         self._cpu_share = CpuShare()
@@ -256,6 +259,9 @@ class Watch(Node):
                 self._page.samples(batch, residuals)
             if found is not None:
                 self._on_alarm(found)
+            elif watcher.alarm is not None and watcher.alarm.hypothesis != self._told \
+                    and watcher.alarm.probability > SURE:
+                self._tell_again(watcher.alarm)
         if batches:
             self._lag_ms = (time.time_ns() - int(batches[-1].stamps[-1])) * 1e-6
         elif now - self._heard > SILENT_S and watcher.note != _NO_SAMPLES and self._heard > -math.inf:
@@ -282,6 +288,7 @@ class Watch(Node):
 
     def _on_alarm(self, found: Finding) -> None:
         self._alarms += 1
+        self._told = found.hypothesis
         ago = self._watcher.detector.time - found.since
         self.get_logger().error(f"model and rig have parted at {found.place}, {ago:.1f} s ago: likeliest "
                                 f"{found.hypothesis} ({found.probability:.0%})")
@@ -298,6 +305,13 @@ class Watch(Node):
                                                 self.get_publishers_info_by_topic(topic)], time.time_ns())
         except OSError as error:
             self.get_logger().error(f"{path}: {error.strerror}: the alarm has no bag")
+
+    def _tell_again(self, found: Finding) -> None:
+        """Correct what was told of an alarm."""
+        self._told = found.hypothesis
+        ago = self._watcher.detector.time - found.since
+        self.get_logger().error(f"corrected: parted at {found.place}, {ago:.1f} s ago: likeliest {found.hypothesis} "
+                                f"({found.probability:.0%})")
 
     def _write_bag(self) -> None:
         assert self._bag is not None
