@@ -86,7 +86,7 @@ class Rig:
         truth[dynamics.ROW.v_a] += sampled - v
         angle = sensing.seen_angle(self.model, truth[dynamics.ROW.theta], truth[dynamics.ROW.theta_dot], self.period,
                                    self._count * self.period)
-        seen = _with_errors(self.model, truth, *angle)
+        seen = _with_errors(self.model, truth, *angle, self.period * np.arange(self._count, self._count + n))
         self._memory = sensing.read(read, seen, self._normal.standard_normal((n, 4)), self._uniform.random((n, 2)),
                                     self._memory, self._count == 0, self._chain)
         self._count += n
@@ -102,15 +102,15 @@ class Rig:
         return Sample(*read[:, 0].tolist()), Truth(*truth[:len(Truth._fields), 0].tolist())
 
 
-def _with_errors(model: Model, truth: Array, theta: Array, theta_dot: Array) -> Array:
+def _with_errors(model: Model, truth: Array, theta: Array, theta_dot: Array, time: Array) -> Array:
     """The states (7, N) as the sensors see them: with the errors of readings that are given by formulas."""
     if not sensing.readings_with_errors(model):
         return truth
     seen, row = truth.copy(), dynamics.ROW
     seen[row.theta], seen[row.theta_dot] = theta, theta_dot
     alone = model.with_effects({id_: p for id_, p in model.effects.items() if id_ not in CATALOGUE})
-    seen[row.i_a] = sensing.read_current(alone, truth[row.i_a])
-    seen[row.v_a] = sensing.read_voltage(alone, truth[row.v_a])
+    seen[row.i_a] = sensing.read_current(alone, truth[row.i_a], time)
+    seen[row.v_a] = sensing.read_voltage(alone, truth[row.v_a], time)
     return seen
 
 

@@ -97,31 +97,33 @@ def readings_with_errors(model: Model) -> set[str]:
     return {e.reading for id_ in model.effects if (e := DEFINED.get(id_)) is not None and e.term and e.reading}
 
 
-def read_current(model: Model, current: ScalarOrArray) -> ScalarOrArray:
+def read_current(model: Model, current: ScalarOrArray, time: ScalarOrArray | float = 0.0) -> ScalarOrArray:
     """Reading of a current before noise and quantisation.
 
     Args:
         model: its effects `current_gain` and `current_offset` act, and its effects by formula.
         current: [A] scalar or (N,) true current.
+        time: [s] of it, for formulas that depend on it.
 
     Returns:
         [A] i (1 + gain) + bias, in the shape of `current`.
     """
-    current = current + _error(model, "i_a", i_a=current)
+    current = current + _error(model, "i_a", time, i_a=current)
     return current * (1.0 + model.effect("current_gain", "gain")) + model.effect("current_offset", "bias")
 
 
-def read_voltage(model: Model, voltage: ScalarOrArray) -> ScalarOrArray:
+def read_voltage(model: Model, voltage: ScalarOrArray, time: ScalarOrArray | float = 0.0) -> ScalarOrArray:
     """Reading of a voltage before noise and quantisation.
 
     Args:
         model: its effect `voltage_offset` acts, and its effects by formula.
         voltage: [V] scalar or (N,) true voltage at the motor's terminals.
+        time: [s] of it, for formulas that depend on it.
 
     Returns:
         [V] v + bias, in the shape of `voltage`.
     """
-    return voltage + _error(model, "v_a", v=voltage) + model.effect("voltage_offset", "bias")
+    return voltage + _error(model, "v_a", time, v=voltage) + model.effect("voltage_offset", "bias")
 
 
 def true_voltage(model: Model, reading: ScalarOrArray) -> ScalarOrArray:
@@ -141,12 +143,13 @@ def true_voltage(model: Model, reading: ScalarOrArray) -> ScalarOrArray:
     return true
 
 
-def _error(model: Model, channel: str, **known: ScalarOrArray) -> ScalarOrArray:
+def _error(model: Model, channel: str, time: ScalarOrArray | float, **known: ScalarOrArray) -> ScalarOrArray:
     """The error of a reading that formulas give, in the shape of the quantity that it depends on; 0.0 without any."""
     if channel not in readings_with_errors(model):
         return 0.0  # type: ignore[return-value]
     (value,) = known.values()
-    found = series(model.effects, channel, np.size(value), 0.0, **{name: np.ravel(x) for name, x in known.items()})
+    found = series(model.effects, channel, np.size(value), 0.0, t=np.ravel(time),
+                   **{name: np.ravel(x) for name, x in known.items()})
     return found.reshape(np.shape(value)) if np.ndim(value) else float(found[0])  # type: ignore[return-value]
 
 

@@ -113,7 +113,8 @@ class CutChain:
             with np.errstate(all="ignore"):  # a fit may try a bridge whose voltage does not depend on the duty
                 before = float(np.nan_to_num(actuator.duty(n, first)))
             v = of(n, s.duty, m.effects, s.period, start=-piece.start, before=before)
-            out[piece] = sensing.read_voltage(m, actuator.terminal_voltage(m, v[piece], self.current[piece], s.period))
+            seen = actuator.terminal_voltage(m, v[piece], self.current[piece], s.period)
+            out[piece] = sensing.read_voltage(m, seen, s.period * np.arange(len(s))[piece])
         return out
 
     def actuator_residuals(self, values: Values) -> dict[str, Array]:
@@ -186,7 +187,8 @@ class CutChain:
         i_a, omega, angle = self.motor(values, s.train)
         residuals = {}
         if s.has("i_a"):
-            read = [sensing.read_current(m, i_a[piece]) for piece, m in self.pieces(values, s.train)]
+            time = s.period * np.arange(s.train)
+            read = [sensing.read_current(m, i_a[piece], time[piece]) for piece, m in self.pieces(values, s.train)]
             residuals["i_a"] = self._train(s.i_a, np.concatenate(read)) / s.sigma["i_a"]
         if s.pulses is not None:
             p = s.pulses
