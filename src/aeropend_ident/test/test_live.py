@@ -7,8 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from aeropend_ident.commands import live
 from aeropend_ident.live import false_alarms
-from aeropend_ident.live.bank import columns
+from aeropend_ident.live.bank import columns, size_of
 from aeropend_ident.live.companion_model import Companion, Samples
 from aeropend_ident.live.intake import Batch, Intake
 from aeropend_ident.live.watcher import PARTED, STALE, Watcher
@@ -182,3 +183,33 @@ def test_a_torque_that_is_missing_is_no_speed_of_an_arm_at_rest():
     for effect in ("axial_inflow", "encoder_lag", "quadratic_drag"):
         assert moved[effect] < 0.02, effect
     assert moved["cable_torque"] > 0.5
+
+
+@pytest.mark.parametrize("effect", live.SWITCHED)
+def test_each_effect_of_the_command_live_begins_at_its_instant(effect, tmp_path):
+    live.draw(tmp_path, effect, 3.0, 7)
+    changed = load(str(tmp_path / "rig.yaml"))
+    duty = Excitation(duration=6.0, seed=4).series()
+    with_, without = (Rig(Model("rig", changed.model, changed.sensing, effects), seed=1).run(duty)[0]
+                      for effects in (changed.effects, {}))
+    moved = np.abs(with_ - without).max(axis=0)
+    first = round(3.0 / SAMPLE_PERIOD)
+    assert moved[:first].max() < 1e-6
+    assert moved[first:].max() > 0.01
+
+
+@pytest.mark.parametrize(("effect", "own"), [
+    ("cable_torque", {"k": 3.0, "theta0": 0.4}), ("encoder_eccentricity", {"amplitude": 0.03, "phase": 1.2}),
+])
+def test_an_effect_that_is_linear_in_two_parameters_has_two_columns_for_all_their_values(effect, own):
+    bench = load("bench")
+    duty = Excitation(duration=20.0, seed=4).series()
+    read, _ = Rig(Model("rig", bench.model, bench.sensing, {effect: own}), seed=2).run(duty)
+    bank = columns(bench)
+    rows = Companion(bench, bank).step(Samples(*read, duty)).rows["arm"][round(2.0 / SAMPLE_PERIOD):]
+    at = [k for k, c in enumerate(c for c in bank if "arm" in c.stages) if c.effect == effect]
+    two = [c for c in bank if c.effect == effect]
+    assert len(at) == len(two) == 2
+    sizes = np.linalg.lstsq(rows[:, :1] - rows[:, [1 + k for k in at]], rows[:, 0], rcond=None)[0]
+    found = size_of(two, [size * c.step for size, c in zip(sizes, two, strict=True)])
+    assert found == pytest.approx(next(iter(own.values())), rel=0.1)

@@ -8,7 +8,9 @@ diagnosis. So every equation stays in `aeropend_sim.model`.
 
 from __future__ import annotations
 
+import cmath
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from aeropend_ident.diagnosis.chain.priors import CHAIN_SD, NOMINAL_SD, usual_size
@@ -46,6 +48,8 @@ class Column:
         log_odds: prior log odds of the hypothesis over the number of its columns.
         size: name of the size, as in the model file.
         unit: of the size.
+        joint: whether the hypothesis is linear in the sizes of its columns together (`Effect.linear_in`): else they
+            are tried one by one.
     """
 
     hypothesis: str
@@ -59,6 +63,12 @@ class Column:
     log_odds: float
     size: str
     unit: str
+    joint: bool = False
+
+    @property
+    def sticks(self) -> bool:
+        """Whether it is a dry friction of the arm."""
+        return self.effect in DEFINED and DEFINED[self.effect].sticks
 
     @property
     def effect(self) -> str:
@@ -80,6 +90,19 @@ def stages_of(effect: str) -> tuple[str, ...]:
     if e.place == "sensing":
         return {"v_a": ("actuator", "motor"), "i_a": ("motor",)}.get(e.reading, ("arm",))
     return {"actuator": ("actuator",), "electrical": ("motor",), "rotor": ("motor",)}.get(e.place, ("arm",))
+
+
+def size_of(columns: Sequence[Column], sizes: Sequence[float]) -> float:
+    """Size of an effect from those of its columns, SI.
+
+    Args:
+        columns: of one hypothesis: one, or those that are joint.
+        sizes: of them.
+    """
+    if len(columns) == 1 or DEFINED[columns[0].effect].linear_in != "polar":
+        return sum(sizes)
+    phase = next(name for name, _ in columns[0].values if name != columns[0].size)
+    return abs(sum(size * cmath.exp(1j * dict(c.values)[phase]) for c, size in zip(columns, sizes, strict=True)))
 
 
 def columns(model: Model) -> list[Column]:
@@ -116,8 +139,11 @@ def _of_effect(h: Hypothesis, model: Model) -> list[Column]:
         starts = tuple((replace(h.own[0], start=size.neutral + share * usual),) for share in LONGEST_DELAY)
     elif h.effect in ("coulomb_friction", "rotor_friction"):
         starts = h.starts[:1]
+    joint = bool(DEFINED[h.effect].linear_in)
+    if joint:  # two columns span all values of both parameters
+        starts = (h.starts[0], h.starts[-1])
     sign = 1 if size.low >= size.neutral else 0
     return [Column(h.name, h.place, stages_of(h.effect), tuple((p.name, p.begin) for p in own),
                    own[0].begin - size.neutral, IMPERFECTION * abs(usual), own[0].sd, sign,
-                   h.log_odds - math.log(len(starts)), own[0].name, size.unit)
+                   h.log_odds - (0.0 if joint else math.log(len(starts))), own[0].name, size.unit, joint)
             for own in starts]

@@ -9,7 +9,8 @@ residual of the arm. Each column of the bank (`bank`) has a model of its own bes
 An observer whose model lacks a torque also gets a speed that is not there: at rest its correction of the angle and this
 speed cancel. Terms that depend on the speed of the arm would then follow the residual itself, and explain any. So the
 sensitivities of the arm are those around the motion that was measured: the observers of the columns, and a nominal one
-that they are compared with, get the torque that is missing, which a disturbance observer estimates.
+that they are compared with, get the torque that is missing, which a disturbance observer estimates. Dry friction is
+compared without it, for it holds the arm against a torque that is missing.
 """
 
 from __future__ import annotations
@@ -239,14 +240,15 @@ def _turned(ring: Array, j: int, t: float, count: int, h: float) -> float:
 
 
 @njit(nogil=True)
-def _arm(theta: Array, speed: Array, gains: Array, stages: Array, states: Any, c: Any, e: Any, x: Any, chain: Any,
-         added: Any, out: Array) -> None:
+def _arm(theta: Array, speed: Array, gains: Array, helped: NDArray[np.bool_], stages: Array, states: Any, c: Any,
+         e: Any, x: Any, chain: Any, added: Any, out: Array) -> None:
     """Advance the observers of the arm by N samples.
 
     Args:
         theta: (N,) [rad] angle read.
         speed: (N + 1,) [rad/s] speed of the rotor, the sample before first.
         gains: (3,) of the observer: [1], [1/s], and [1/s²] of its torque.
+        helped: (M,) which of them get the missing torque; the second estimates it.
         stages: (M, 2) states of the angle's filter.
         states: of `_Members`.
         c: of `_Members`.
@@ -255,8 +257,6 @@ def _arm(theta: Array, speed: Array, gains: Array, stages: Array, states: Any, c
         chain: of `_Members`.
         added: of `_Members`.
         out: (N, M), filled with the innovations [rad].
-
-    The first member is without the missing torque, the second estimates it, and all others get it from there.
     """
     n, size = theta.shape[0], out.shape[1]
     for k in range(n):
@@ -268,7 +268,7 @@ def _arm(theta: Array, speed: Array, gains: Array, stages: Array, states: Any, c
             rise = (speed[k + 1] - w) / c[j].steps
             for _ in range(c[j].steps):
                 now = dynamics.State(0.0, w, 0.0, s.theta, s.theta_dot, s.thrust, 0.0, s.flex, s.flex_dot,
-                                     torque if j > 0 else 0.0, s.time, s.memory)
+                                     torque if helped[j] else 0.0, s.time, s.memory)
                 past = None if added is None else dynamics.pasts(now, 0.0, c[j], added)
                 m, f1 = dynamics.advance_arm(now, w + 0.5 * rise, w + rise, past, c[j], e[j], x[j], added)
                 w += rise
@@ -324,6 +324,7 @@ class Companion:
         behind = [actuator.behind_terminals(m) for m in models["motor"]]
         self._motor = _Members(behind, period)
         self._arm = _Members([model, *models["arm"]], period)
+        self._helped = np.array([False, True, *(not c.sticks for c in self.columns["arm"])])
         self._chain = _Members([model], period)
         longest = max(m.effect("command_delay", "delay") for m in self._actuators)
         self._history = math.ceil(longest / period) + 2
@@ -332,7 +333,8 @@ class Companion:
         gravity, damping = model.numbers()["mgd_over_J"], model.numbers()["c_over_J"]
         rate = OBSERVER_RATE * math.sqrt(gravity / REFERENCE_GRAVITY)
         first = max(2.0 * OBSERVER_DAMPING * rate - damping, 0.0)
-        self._gains = np.array([first, max(rate * rate - gravity - damping * first, 0.0), DISTURBANCE * rate**3]) * period
+        second = max(rate * rate - gravity - damping * first, 0.0)
+        self._gains = np.array([first, second, DISTURBANCE * rate**3]) * period
         self.floors = {**noises, "omega": max(model.sensing["speed_noise"], 1.0)}
         self.running = False
 
@@ -399,9 +401,10 @@ class Companion:
 
         out = np.empty((n, len(self._arm.states)))
         a = self._arm
-        _arm(samples.theta, np.concatenate([[self._last_speed], speed]), self._gains, self._stages, a.states, a.c, a.e,
-             a.x, a.chain, a.added, out)
-        innovation = (out[:, :1] + np.column_stack([np.zeros(n), out[:, 2:] - out[:, 1:2]])) / self._noise[3]
+        _arm(samples.theta, np.concatenate([[self._last_speed], speed]), self._gains, self._helped, self._stages,
+             a.states, a.c, a.e, a.x, a.chain, a.added, out)
+        beside = np.where(self._helped, out[:, 1:2], out[:, :1])
+        innovation = (out[:, :1] + (out - beside)[:, [0, *range(2, out.shape[1])]]) / self._noise[3]
 
         said = np.empty((4, n))
         f = self._chain

@@ -31,7 +31,7 @@ from aeropend_ident.diagnosis.chain.priors import SIZE_SD
 from aeropend_ident.diagnosis.chain.values import PLACE_OF_CHANNEL
 from aeropend_ident.diagnosis.search.hypotheses import EFFECT_ODDS
 from aeropend_ident.diagnosis.search.onset import WITHIN
-from aeropend_ident.live.bank import Column
+from aeropend_ident.live.bank import Column, size_of
 from aeropend_ident.live.companion_model import CHANNELS, Residuals
 from aeropend_ident.live.false_alarms import TICK
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
@@ -82,6 +82,10 @@ off leaves about so much)."""
 
 INEXACT = 0.01
 """Share of the evidence by which two instants may differ and fit as well (choice: the columns are linearised)."""
+
+MISFIT = 0.05
+"""Share of the evidence by which two hypotheses may differ and be as likely (choice: the columns are those of small and
+lasting effects; an effect of twice its usual size, or one that has just begun, fits them to some percent)."""
 
 NEAR = 3.0
 """[s] Distance from the instant of an alarm within which all instants are judged with what comes later (choice)."""
@@ -161,7 +165,7 @@ class _Stage:
         self.scale = np.array([c.sd / c.step for c in self.columns])
         self.keep = math.exp(-tick / DRIFT)
         self.x, self.p = np.zeros(d), np.eye(d)
-        self.products, self.cross, self.squares, self.rows = np.zeros((d, d)), np.zeros(d), np.zeros(d), 0.0
+        self.products, self.cross, self.squares, self.rows = np.zeros((d, d)), np.zeros(d), np.zeros((d, d)), 0.0
         self.snapshots: deque[_Snapshot] = deque(maxlen=round(WINDOW / tick) + 1)
 
     def linear(self, rows: Array) -> tuple[Array, Array]:
@@ -182,7 +186,7 @@ class _Stage:
         self.x = x + self.p @ (y - n @ x)
         self.products = self.products + n
         self.cross = self.cross + y
-        self.squares = self.squares + (j * j).sum(axis=0)
+        self.squares = self.squares + j.T @ j
         self.rows += len(r)
         return np.asarray(left)
 
@@ -193,7 +197,7 @@ class _Stage:
                                         self.squares, self.rows))
 
     def scores(self, pairs: Sequence[tuple[_Snapshot, _Snapshot]]) -> tuple[Array, Array, Array]:
-        """Score and information (K, D) of a jump of each size at each instant, and the mean square of its column.
+        """Score (K, D) and information (K, D, D) of jumps at each instant, and mean products of the columns (K, D, D).
 
         Args:
             pairs: the instant, and the end of its guard.
@@ -204,10 +208,10 @@ class _Stage:
         b = np.array([s.pull for s, _ in pairs]) + y
         solved = np.linalg.solve(a, np.concatenate([n, b[:, :, None]], axis=2))
         score = y - np.einsum("kij,kj->ki", n, solved[:, :, -1])
-        information = np.einsum("kii->ki", n) - np.einsum("kij,kji->ki", n, solved[:, :, :-1])
+        information = n - n @ solved[:, :, :-1]
         rows = np.maximum(self.rows - np.array([b.rows for _, b in pairs]), 1.0)
-        mean = (self.squares - np.array([b.squares for _, b in pairs])) / rows[:, None]
-        return score, np.maximum(information, 0.0), mean
+        mean = (self.squares - np.array([b.squares for _, b in pairs])) / rows[:, None, None]
+        return score, information, mean
 
     def reset(self) -> None:
         """Forget the instants, and keep the sizes."""
@@ -367,14 +371,23 @@ class Detector:
                 self.alarm = best
         return None
 
-    def _show(self, shown: dict[str, PlaceState], c: Column, information: Array, size: Array, mean: Array, k: int
+    def _show(self, shown: dict[str, PlaceState], c: Column, information: Array, size: float, mean: Array, k: int
               ) -> None:
-        """Note the least gap that a column would show, and the gap that it makes now."""
+        """Note the least gap that a change would show, and the gap that it makes now.
+
+        Args:
+            shown: filled.
+            c: a column of it.
+            information: (K,) of its size at each instant.
+            size: of it, in standard deviations.
+            mean: (K,) mean square of its column.
+            k: the likeliest instant.
+        """
         at = int(np.argmax(information))
-        needed = self.limit + 0.5 * math.log1p(information[at] * (c.wide / c.sd) ** 2) - c.log_odds
+        needed = self.limit + 0.5 * math.log1p(max(information[at], 0.0) * (c.wide / c.sd) ** 2) - c.log_odds
         least = math.sqrt(2.0 * needed / max(information[at], 1e-12))  # in standard deviations of the size
         limit = max(least * math.sqrt(mean[at]), 1e-9) if information[at] > 1e-9 else math.inf
-        gap = abs(float(size[k])) * math.sqrt(mean[k])
+        gap = size * math.sqrt(mean[k])
         excited = least * c.sd < c.wide / SIZE_SD
         before = shown.get(c.place)
         if before is None or (excited, gap / limit) > (before.excited, before.gap / before.limit):
@@ -396,8 +409,7 @@ class Detector:
 
     def changes(self) -> list[Finding]:
         """All hypotheses on a change, the likeliest first, each at its likeliest instant."""
-        table: dict[tuple[str, tuple[tuple[str, float], ...]], list[tuple[Array, Array, Array]]] = {}
-        column_of = {}
+        table: dict[tuple[object, ...], tuple[list[Column], list[tuple[Array, Array, Array]]]] = {}
         times: list[float] = []
         for name, stage in self.stages.items():
             pairs = self._frozen.get(name) or self._pairs(stage)
@@ -405,25 +417,34 @@ class Detector:
                 return []
             times = [s.time for s, _ in pairs]
             score, information, mean = stage.scores(pairs)
-            for k, c in enumerate(stage.columns):
-                table.setdefault((c.hypothesis, c.values), []).append((score[:, k], information[:, k], mean[:, k]))
-                column_of[(c.hypothesis, c.values)] = c
+            groups: dict[tuple[object, ...], list[int]] = {}
+            for i, c in enumerate(stage.columns):
+                groups.setdefault((c.hypothesis,) if c.joint else (c.hypothesis, c.values), []).append(i)
+            for which, own in groups.items():
+                together = np.ix_(range(len(times)), own, own)
+                table.setdefault(which, ([stage.columns[i] for i in own], []))[1].append(
+                    (score[:, own], information[together], mean[together]))
         best: dict[str, Finding] = {}
         total: dict[str, float] = {}
         shown: dict[str, PlaceState] = {}
-        for which, parts in table.items():
-            c = column_of[which]
+        for columns, parts in table.values():
+            c = columns[0]
             if c.wide <= 0.0:
                 continue
             score, information = (np.sum([p[i] for p in parts], axis=0) for i in (0, 1))
             mean = np.max([p[2] for p in parts], axis=0)
-            ratio = (c.wide / c.sd) ** 2
-            size = score / (information + 1.0 / ratio)
-            evidence = 0.5 * score * size - 0.5 * np.log1p(information * ratio) + c.log_odds
+            prior = np.diag([(c.sd / c.wide) ** 2 for c in columns])
+            size = np.linalg.solve(information + prior, score[:, :, None])[:, :, 0]
+            evidence = 0.5 * (score * size).sum(axis=1) - 0.5 * np.linalg.slogdet(
+                np.eye(len(columns)) + np.linalg.solve(prior, information))[1] + c.log_odds
+            told = np.array([size_of(columns, [x * c.sd for x, c in zip(sizes, columns, strict=True)])
+                             for sizes in size.tolist()])
             if c.sign:
-                evidence = np.where(size * c.sign > 0.0, evidence, -np.inf)
+                evidence = np.where(told * c.sign > 0.0, evidence, -np.inf)
             k = int(np.argmax(evidence))
-            self._show(shown, c, information, size, mean, k)
+            far = max(float(np.linalg.norm(size[k])), 1e-12)
+            u = size[k] / far
+            self._show(shown, c, u @ information @ u, far, np.maximum(u @ mean @ u, 0.0), k)
             if not np.isfinite(evidence[k]):
                 continue
             total[c.hypothesis] = np.logaddexp(total.get(c.hypothesis, -np.inf), np.logaddexp.reduce(evidence))
@@ -431,14 +452,14 @@ class Detector:
                 near = [times[i] for i in np.flatnonzero(
                     evidence > evidence[k] - WITHIN - INEXACT * abs(evidence[k]))]
                 best[c.hypothesis] = Finding(
-                    c.hypothesis, c.place, float(evidence[k]), float(size[k] * c.sd), 0.5 * (min(near) + max(near)),
-                    float(abs(size[k]) * math.sqrt(mean[k])), (min(near), max(near)))
+                    c.hypothesis, c.place, float(evidence[k]), float(told[k]), 0.5 * (min(near) + max(near)),
+                    far * math.sqrt(max(float(u @ mean[k] @ u), 0.0)), (min(near), max(near)))
         self._shown = shown
         for f in self._random():
             best[f.hypothesis], total[f.hypothesis] = f, f.evidence
         top = max(total.values(), default=0.0)
-        norm = sum(math.exp(v - top) for v in total.values())
-        found = [replace(f, probability=math.exp(total[f.hypothesis] - top) / norm) for f in best.values()]
+        like = {name: math.exp((v - top) / (1.0 + MISFIT * max(top, 0.0))) for name, v in total.items()}
+        found = [replace(f, probability=like[f.hypothesis] / sum(like.values())) for f in best.values()]
         return sorted(found, key=lambda f: -f.evidence)
 
     def shows(self, place: str) -> PlaceState:

@@ -12,7 +12,7 @@ from aeropend_ident.diagnosis.chain.values import PLACE_OF_CHANNEL
 from aeropend_ident.live.bank import columns
 from aeropend_ident.live.companion_model import CHANNELS, Companion, Residuals
 from aeropend_ident.live.detector import LEARNS, Detector, Finding
-from aeropend_ident.live.false_alarms import TICK, limit
+from aeropend_ident.live.false_alarms import limit
 from aeropend_ident.live.intake import Batch
 from aeropend_sim.model.effects import PLACES
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
@@ -188,7 +188,3 @@ class Watcher:
                 effect, probability, size = finding.hypothesis, finding.probability, finding.size
                 since = self.stamp_of(finding.since)
             self.places[name] = Place(state, seen.gap, seen.limit, residual[name], effect, probability, size, since)
-
-
-SECONDS_PER_JUDGEMENT = JUDGED * TICK
-"""[s] Time between two judgements (derived)."""
