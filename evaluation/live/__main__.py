@@ -29,6 +29,7 @@ from aeropend_ident.live.intake import Batch
 from aeropend_ident.live.watcher import Watcher
 from aeropend_sim.model.parameters import load
 from evaluation.blind.plant import PERIOD
+from evaluation.blind.score import wilson
 from evaluation.live import rigs
 from evaluation.results import put
 
@@ -40,6 +41,9 @@ BATCH = 25
 
 NAMED_WITHIN = 20.0
 """[s] After the alarm or the begin within which the effect must be named."""
+
+KINDS = ("nominal", "messy", "resting")
+"""Kinds of rigs in which an effect begins: the last is nominal, in a loop that rests for long between references."""
 
 PAGE = Path(__file__).parents[2] / "docs" / "results" / "live.md"
 
@@ -101,17 +105,26 @@ def watched(samples: Samples, since: float, watcher: Watcher | None = None) -> T
                 max(places, key=lambda p: places[p]), best.hypothesis, levels, load_)
 
 
-def cases(count: int, seed: int, keep: Path | None, *, imperfect: bool) -> Iterable[rigs.Case]:
-    """The recordings in which an effect begins, drawn in turn over effects and controllers; kept ones are read."""
+def cases(count: int, seed: int, keep: Path | None, kind: str) -> Iterable[rigs.Case]:
+    """The recordings in which an effect begins, drawn in turn over effects and controllers; kept ones are read.
+
+    Args:
+        count: of the recordings.
+        seed: of the first one.
+        keep: folder that keeps them.
+        kind: of `KINDS`.
+    """
+    names = rigs.LOOPS if kind == "resting" else rigs.CONTROLLERS
     for k in range(count):
         rep, i = divmod(k, len(rigs.BEGINNING))
-        name = rigs.CONTROLLERS[(rep * 5 + i * 3 + seed) % len(rigs.CONTROLLERS)]
+        name = names[(rep * 5 + i * 3 + seed) % len(names)]
         number = seed + 100 * rep + i
-        kept = keep / f"{'m' if imperfect else 'c'}{number}.pkl" if keep else None
+        kept = keep / f"{kind}-{number}.pkl" if keep else None
         if kept and kept.exists():
             yield pickle.loads(kept.read_bytes())
             continue
-        case = rigs.draw(rigs.BEGINNING[i], name, number, imperfect=imperfect)
+        case = rigs.draw(rigs.BEGINNING[i], name, number, imperfect=kind == "messy",
+                         holds=rigs.RESTS if kind == "resting" else rigs.HOLDS)
         if kept:
             kept.write_bytes(pickle.dumps(case))
         yield case
@@ -121,10 +134,8 @@ def share(hits: int, of: int) -> str:
     """A share with its 95 % interval (Wilson)."""
     if of == 0:
         return "none"
-    z, p = 1.96, hits / of
-    middle, half = (p + z * z / (2 * of)) / (1 + z * z / of), z / (1 + z * z / of) * math.sqrt(
-        p * (1 - p) / of + z * z / (4 * of * of))
-    return f"{100 * p:.0f} % ({100 * max(middle - half, 0):.0f} to {100 * min(middle + half, 1):.0f}) of {of}"
+    low, high = wilson(hits, of)
+    return f"{100 * hits / of:.0f} % ({100 * low:.0f} to {100 * high:.0f}) of {of}"
 
 
 def detection(all_: Sequence[tuple[rigs.Case, Told]]) -> list[tuple[str, str, str]]:
@@ -186,6 +197,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="evaluation.live", description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=3 * len(rigs.BEGINNING), help="recordings with an effect")
     parser.add_argument("--messy", type=int, default=len(rigs.BEGINNING), help="the same on messy rigs")
+    parser.add_argument("--resting", type=int, default=len(rigs.BEGINNING), help="the same in loops that rest for long")
     parser.add_argument("--hours", type=float, default=24.0, help="hours of nominal rigs without a change")
     parser.add_argument("--messy-hours", type=float, default=4.0, help="hours of messy rigs without a change")
     parser.add_argument("--seed", type=int, default=SEED)
@@ -197,9 +209,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.keep.mkdir(parents=True, exist_ok=True)
     with threadpool_limits(1):
         rows: list[tuple[str, str, str, str]] = []
-        for kind, count, imperfect in (("nominal", options.count, False), ("messy", options.messy, True)):
+        for k, (kind, count) in enumerate(zip(KINDS, (options.count, options.messy, options.resting), strict=True)):
             all_ = []
-            for case in cases(count, options.seed + 10_000 * imperfect, options.keep, imperfect=imperfect):
+            for case in cases(count, options.seed + 10_000 * k, options.keep, kind):
                 all_.append((case, watched(case.samples, case.since)))
                 if options.each:
                     c, t = all_[-1]

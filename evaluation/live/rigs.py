@@ -35,8 +35,8 @@ QUIET = (80.0, 110.0)
 AFTER = 25.0
 """[s] Of the recording after that."""
 
-HOLDS = (2.0, 5.0)
-"""[s] Between two references."""
+HOLDS, RESTS = (2.0, 5.0), (5.0, 40.0)
+"""[s] Between two references of a loop that moves, and of one that rests for long."""
 
 SPEEDS = (60.0, 130.0)
 """[rad/s] References of the speed."""
@@ -84,26 +84,29 @@ class Case:
     samples: Samples
 
 
-def references(rng: np.random.Generator, n: int, low: float, high: float) -> Array:
-    """References (n,) that jump."""
+def references(rng: np.random.Generator, n: int, low: float, high: float, holds: tuple[float, float]) -> Array:
+    """References (n,) that jump after some seconds."""
     out, k = np.zeros(n), 0
     while k < n:
-        hold = round(rng.uniform(*HOLDS) / PERIOD)
+        hold = round(rng.uniform(*holds) / PERIOD)
         out[k:k + hold] = rng.uniform(low, high)
         k += hold
     return out
 
 
-def law_of(name: str, model: Model, rng: np.random.Generator, n: int) -> Law:
-    """A controller in its loop: one of `LAWS` or of `controllers.ALL`, by name."""
+def law_of(name: str, model: Model, rng: np.random.Generator, n: int, holds: tuple[float, float] = HOLDS) -> Law:
+    """A controller in its loop: one of `LAWS`, with a reference that jumps, or of `controllers.ALL`, by name."""
     if name in LAWS:
         kind = LAWS[name]
         law = kind.make(model, kind.tune(model))
-        goal = references(rng, n, *(SPEEDS if kind.reference_unit == "rad/s" else ANGLES))
+        goal = references(rng, n, *(SPEEDS if kind.reference_unit == "rad/s" else ANGLES), holds)
         return lambda t, s: law.step(s, float(goal[min(round(t / PERIOD), n - 1)]))
     other = {f.__name__: f for f in controllers.ALL}[name](rng)
     return lambda t, s: other(t, s.theta)
 
+
+LOOPS = tuple(LAWS)
+"""Names of the controllers whose references may rest."""
 
 CONTROLLERS = (*LAWS, *(f.__name__ for f in controllers.ALL))
 """Names of all controllers."""
@@ -162,7 +165,8 @@ def sizer(seed: int) -> cases.Sizer:
     return _SIZERS[seed]
 
 
-def draw(effect: str, controller: str, seed: int, *, imperfect: bool = False) -> Case:
+def draw(effect: str, controller: str, seed: int, *, imperfect: bool = False, holds: tuple[float, float] = HOLDS
+         ) -> Case:
     """A recording of a rig in whose loop an effect begins.
 
     Args:
@@ -170,6 +174,7 @@ def draw(effect: str, controller: str, seed: int, *, imperfect: bool = False) ->
         controller: name.
         seed: of all that is drawn.
         imperfect: with many small imperfections besides, from the start.
+        holds: [s] between two references.
     """
     rng = np.random.default_rng(seed)
     model = load("bench")
@@ -188,7 +193,7 @@ def draw(effect: str, controller: str, seed: int, *, imperfect: bool = False) ->
     change = round(rng.uniform(*QUIET) / PERIOD)
     n = change + round(AFTER / PERIOD)
     gusts = cases.gusts_of(entry, n, other=other > 0) if effect == "gust" else np.zeros(0)
-    law = law_of(controller, model, rng, n)
+    law = law_of(controller, model, rng, n, holds)
     y, v, applied = closed_loop(without, (change, with_), gusts, law, n, model.sensing, rng)
     columns = measured(without, y, v, model.sensing, rng, (change, with_))
     shown = shown_in_loop(without, with_, applied, change, gusts)

@@ -94,16 +94,30 @@ def check(name: str, child: subprocess.Popen[str], log: Path) -> None:
         raise DemoError(f"{name} ended with {child.returncode}: {lines[-1] if lines else 'no output'} (see {log})")
 
 
+def made(folder: Path) -> None:
+    """Make the folder for everything, which must be new."""
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise DemoError(f"{folder}: {error.strerror}; give a new folder with --out") from None
+
+
+def environment() -> dict[str, str]:
+    """Environment of the programs: a graph of their own on this machine, unless the caller has chosen one."""
+    own = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    own.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    own.setdefault("ROS_DOMAIN_ID", str(os.getpid() % 100 + 1))
+    return own
+
+
 def measure(folder: Path, rig: Path, duration: float, seed: int, console: Console) -> Path:
     """Run the plant, excite it and record it, for `duration` seconds; returns the recording."""
     bag = folder / "recording"
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    environment.setdefault("ROS_DOMAIN_ID", str(os.getpid() % 100 + 1))
+    own = environment()
     logs = {name: folder / f"{name}.log" for name in MODULES}
 
     def start(name: str, *arguments: str):  # type: ignore[no-untyped-def]
-        return process(name, *arguments, environment=environment, log=logs[name])
+        return process(name, *arguments, environment=own, log=logs[name])
 
     with (
         Progress(TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), console=console) as bar,
@@ -160,10 +174,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console = Console(stderr=True)
     folder = options.out or Path("demo-results") / datetime.now().strftime("%Y%m%d-%H%M%S")
     signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
-    try:
-        folder.mkdir(parents=True)
-    except OSError as error:
-        raise DemoError(f"{folder}: {error.strerror}; give a new folder with --out") from None
+    made(folder)
     drawn, rig = draw(options.effect, options.seed)
     save(rig, folder / "rig.yaml", "the rig of the demo, hidden from diagnose")
     seed = options.seed if options.seed is not None else int(np.random.default_rng().integers(1000))

@@ -13,19 +13,24 @@ import random
 import signal
 import time
 import webbrowser
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from datetime import datetime
 from pathlib import Path
 from subprocess import Popen
 
 import numpy as np
+from rclpy.context import Context
+from rclpy.node import Node
+from std_msgs.msg import Float64
 
-from aeropend_ident.commands.demo import DemoError, check, process
+from aeropend_ident.commands.demo import check, environment, made, process
 from aeropend_sim.cli.command import Parser, entry_point
 from aeropend_sim.model import effect_file
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import Model, load, save
+from aeropend_sim.ros import interface
+from aeropend_sim.ros.transport import without_shared_memory
 
 NUMBER_ERROR = 0.03
 """Each number of the plant is off from the model by up to this share (choice: as in the demo)."""
@@ -38,6 +43,9 @@ SPREAD_S = 60.0
 
 HOLD_S = (2.0, 5.0)
 """[s] Time between two references (choice)."""
+
+REPEAT_S = 0.2
+"""[s] Time between two messages of the same reference (choice: a controller that has just started gets it soon)."""
 
 ANGLES = (0.1, 0.6)
 """[rad] References (choice: between hanging and horizontal)."""
@@ -116,14 +124,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parse(arguments)
     folder = options.out or Path("live-results") / datetime.now().strftime("%Y%m%d-%H%M%S")
     signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
-    try:
-        folder.mkdir(parents=True)
-    except OSError as error:
-        raise DemoError(f"{folder}: {error.strerror}; give a new folder with --out") from None
+    made(folder)
     drawn, since = draw(folder, options.effect, options.since, options.seed)
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    environment.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    environment.setdefault("ROS_DOMAIN_ID", str(os.getpid() % 100 + 1))
+    own = environment()
+    os.environ.update(own)
     page = f"http://127.0.0.1:{options.port}"
     print(f"A rig runs, and an effect begins {LEARNED_S:.0f} to {LEARNED_S + SPREAD_S:.0f} s after its start. The page"
           f" of watch is at {page}\nCtrl-C ends it and tells what was hidden; all is in {folder}", flush=True)
@@ -137,9 +141,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                        f"bags:={folder / 'alarms'}", "-p", "diagnose:=true"]),
         ):
             log = folder / f"{name}.log"
-            running[name] = stack.enter_context(process(name, *args, environment=environment, log=log)), log
+            running[name] = stack.enter_context(process(name, *args, environment=own, log=log)), log
         try:
-            _drive(environment, folder, running, chance, options, page)
+            _drive(folder, running, chance, options, page)
         finally:
             said = (folder / "watch.log").read_text(encoding="utf-8").splitlines()
             told = [line for line in said if "parted" in line]
@@ -147,21 +151,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _drive(environment: dict[str, str], folder: Path, running: Mapping[str, tuple[Popen[str], Path]],
-           chance: random.Random, options: argparse.Namespace, page: str) -> None:
+def _drive(folder: Path, running: Mapping[str, tuple[Popen[str], Path]], chance: random.Random,
+           options: argparse.Namespace, page: str) -> None:
     """Send references until the time is over."""
     begun = time.monotonic()
-    opened = options.no_browser
-    while time.monotonic() < begun + options.seconds:
-        for name, (child, log) in running.items():
-            check(name, child, log)
-        if not opened and "page: " in (folder / "watch.log").read_text(encoding="utf-8"):
-            webbrowser.open(page)
-            opened = True
-        with process("reference", f"{chance.uniform(*ANGLES):.3f}", environment=environment,
-                     log=folder / "reference.log") as child:
-            time.sleep(min(chance.uniform(*HOLD_S), max(begun + options.seconds - time.monotonic(), 0.0)))
-            child.poll()
+    opened, until, angle = options.no_browser, begun, 0.0
+    with _references() as send:
+        while (now := time.monotonic()) < begun + options.seconds:
+            for name, (child, log) in running.items():
+                check(name, child, log)
+            if not opened and "page: " in (folder / "watch.log").read_text(encoding="utf-8"):
+                webbrowser.open(page)
+                opened = True
+            if now >= until:
+                until, angle = now + chance.uniform(*HOLD_S), chance.uniform(*ANGLES)
+            send(angle)
+            time.sleep(REPEAT_S)
+
+
+@contextmanager
+def _references() -> Iterator[Callable[[float], None]]:
+    """A function that publishes a reference."""
+    without_shared_memory()
+    context = Context()
+    context.init()
+    try:
+        node = Node("references", context=context, use_global_arguments=False, start_parameter_services=False)
+        publisher = node.create_publisher(Float64, interface.REFERENCE, interface.QOS)
+        yield lambda angle: publisher.publish(Float64(data=angle))
+        node.destroy_node()
+    finally:
+        context.try_shutdown()
 
 
 if __name__ == "__main__":
