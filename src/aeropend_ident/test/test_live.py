@@ -2,6 +2,7 @@
 """The model beside the rig, without ROS: residuals, detection, interruptions."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -11,9 +12,11 @@ from aeropend_ident.commands import live
 from aeropend_ident.live import false_alarms
 from aeropend_ident.live.bank import columns, size_of
 from aeropend_ident.live.companion_model import Companion, Samples
+from aeropend_ident.live.detector import Finding
 from aeropend_ident.live.intake import Batch, Intake
 from aeropend_ident.live.watcher import PARTED, STALE, Watcher
 from aeropend_ident.nodes.topic_recorder import DEPTH
+from aeropend_ident.nodes.watch import why
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
 from aeropend_sim.model.rig import Rig
@@ -213,3 +216,9 @@ def test_an_effect_that_is_linear_in_two_parameters_has_two_columns_for_all_thei
     sizes = np.linalg.lstsq(rows[:, :1] - rows[:, [1 + k for k in at]], rows[:, 0], rcond=None)[0]
     found = size_of(two, [size * c.step for size, c in zip(sizes, two, strict=True)])
     assert found == pytest.approx(next(iter(own.values())), rel=0.1)
+
+
+def test_an_effect_is_named_only_if_it_is_more_likely_than_not():
+    finding = Finding("ground_effect", "thrust", 20.0, 0.4, 80.0, 2.0, (79.0, 81.0), 0.71)
+    assert why(finding) == "likeliest ground_effect (71%)"
+    assert why(replace(finding, probability=0.14)) == "not clear yet why, perhaps ground_effect (14%)"

@@ -54,7 +54,7 @@ SILENT_S = 0.5
 """[s] Time without a sample after which the rig counts as silent (choice: ten batches)."""
 
 SURE = 0.5
-"""Probability above which another effect than the one that was told is told (convention: more likely than not)."""
+"""Probability above which an effect is named (convention: more likely than not)."""
 
 TOPICS = {
     interface.JOINT_STATES: "sensor_msgs/msg/JointState",
@@ -261,7 +261,7 @@ class Watch(Node):
                 self._on_alarm(found)
             elif watcher.alarm is not None and watcher.alarm.hypothesis != self._told \
                     and watcher.alarm.probability > SURE:
-                self._tell_again(watcher.alarm)
+                self._tell(watcher.alarm, "as it now looks, they have parted")
         if batches:
             self._lag_ms = (time.time_ns() - int(batches[-1].stamps[-1])) * 1e-6
         elif now - self._heard > SILENT_S and watcher.note != _NO_SAMPLES and self._heard > -math.inf:
@@ -288,10 +288,7 @@ class Watch(Node):
 
     def _on_alarm(self, found: Finding) -> None:
         self._alarms += 1
-        self._told = found.hypothesis
-        ago = self._watcher.detector.time - found.since
-        self.get_logger().error(f"model and rig have parted at {found.place}, {ago:.1f} s ago: likeliest "
-                                f"{found.hypothesis} ({found.probability:.0%})")
+        self._tell(found, "model and rig have parted")
         message = DiagnosticArray(status=self._statuses())
         message.header.stamp = self.get_clock().now().to_msg()
         self._alarm_publisher.publish(message)
@@ -306,12 +303,10 @@ class Watch(Node):
         except OSError as error:
             self.get_logger().error(f"{path}: {error.strerror}: the alarm has no bag")
 
-    def _tell_again(self, found: Finding) -> None:
-        """Correct what was told of an alarm."""
-        self._told = found.hypothesis
+    def _tell(self, found: Finding, what: str) -> None:
+        self._told = found.hypothesis if found.probability > SURE else ""
         ago = self._watcher.detector.time - found.since
-        self.get_logger().error(f"corrected: parted at {found.place}, {ago:.1f} s ago: likeliest {found.hypothesis} "
-                                f"({found.probability:.0%})")
+        self.get_logger().error(f"{what} at {found.place}, {ago:.1f} s ago: {why(found)}")
 
     def _write_bag(self) -> None:
         assert self._bag is not None
@@ -372,6 +367,16 @@ class Watch(Node):
         """One status for each place."""
         name = self.get_fully_qualified_name().lstrip("/")
         return [_status(f"{name}: {place}", state) for place, state in self._watcher.places.items()]
+
+
+def why(found: Finding) -> str:
+    """The effect of an alarm in words, as far as it is clear.
+
+    Args:
+        found: the change.
+    """
+    clear = "likeliest" if found.probability > SURE else "not clear yet why, perhaps"
+    return f"{clear} {found.hypothesis} ({found.probability:.0%})"
 
 
 def _status(name: str, place: Place) -> DiagnosticStatus:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,7 +102,7 @@ class Rig:
         return Sample(*read[:, 0].tolist()), Truth(*truth[:len(Truth._fields), 0].tolist())
 
 
-def _with_errors(model: Model, truth: Array, theta: Array, theta_dot: Array, time: Array) -> Array:
+def _with_errors(model: Model, truth: Array, theta: Array, theta_dot: Array, time: NDArray[np.floating[Any]]) -> Array:
     """The states (7, N) as the sensors see them: with the errors of readings that are given by formulas."""
     if not sensing.readings_with_errors(model):
         return truth

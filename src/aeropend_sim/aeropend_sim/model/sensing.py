@@ -97,7 +97,7 @@ def readings_with_errors(model: Model) -> set[str]:
     return {e.reading for id_ in model.effects if (e := DEFINED.get(id_)) is not None and e.term and e.reading}
 
 
-def read_current(model: Model, current: ScalarOrArray, time: ScalarOrArray | float = 0.0) -> ScalarOrArray:
+def read_current(model: Model, current: ScalarOrArray, time: NDArray[np.floating[Any]] | float = 0.0) -> ScalarOrArray:
     """Reading of a current before noise and quantisation.
 
     Args:
@@ -112,7 +112,7 @@ def read_current(model: Model, current: ScalarOrArray, time: ScalarOrArray | flo
     return current * (1.0 + model.effect("current_gain", "gain")) + model.effect("current_offset", "bias")
 
 
-def read_voltage(model: Model, voltage: ScalarOrArray, time: ScalarOrArray | float = 0.0) -> ScalarOrArray:
+def read_voltage(model: Model, voltage: ScalarOrArray, time: NDArray[np.floating[Any]] | float = 0.0) -> ScalarOrArray:
     """Reading of a voltage before noise and quantisation.
 
     Args:
@@ -139,11 +139,11 @@ def true_voltage(model: Model, reading: ScalarOrArray) -> ScalarOrArray:
     first = reading - model.effect("voltage_offset", "bias")
     true = first
     for _ in range(REPEATED if "v_a" in readings_with_errors(model) else 0):
-        true = first - _error(model, "v_a", v=true)
+        true = first - _error(model, "v_a", 0.0, v=true)
     return true
 
 
-def _error(model: Model, channel: str, time: ScalarOrArray | float, **known: ScalarOrArray) -> ScalarOrArray:
+def _error(model: Model, channel: str, time: NDArray[np.floating[Any]] | float, **known: ScalarOrArray) -> ScalarOrArray:
     """The error of a reading that formulas give, in the shape of the quantity that it depends on; 0.0 without any."""
     if channel not in readings_with_errors(model):
         return 0.0  # type: ignore[return-value]
