@@ -10,7 +10,7 @@ times false.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,7 +143,8 @@ def true_voltage(model: Model, reading: ScalarOrArray) -> ScalarOrArray:
     return true
 
 
-def _error(model: Model, channel: str, time: NDArray[np.floating[Any]] | float, **known: ScalarOrArray) -> ScalarOrArray:
+def _error(model: Model, channel: str, time: NDArray[np.floating[Any]] | float, **known: ScalarOrArray
+           ) -> ScalarOrArray:
     """The error of a reading that formulas give, in the shape of the quantity that it depends on; 0.0 without any."""
     if channel not in readings_with_errors(model):
         return 0.0  # type: ignore[return-value]
