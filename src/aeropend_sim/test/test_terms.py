@@ -85,6 +85,16 @@ def test_the_true_voltage_is_the_inverse_of_its_reading():
     assert sensing.read_voltage(model, 2.0) == pytest.approx(2.0 + 0.1 * 1.6)
 
 
+def test_the_true_voltage_is_that_of_an_error_which_depends_on_the_time():
+    effect_file.define({"creeping": {"place": "sensing", "reading": "v_a", "term": "k * t * v", "parameters": {
+        "k": {"unit": "1/s", "default": 0.01, "low": 0.0, "high": 1.0}}}}, "test")
+    model, time, volts = with_("creeping"), np.linspace(0.0, 20.0, 50), np.linspace(1.0, 6.0, 50)
+    read = sensing.read_voltage(model, volts, time)
+    assert read == pytest.approx(volts * (1.0 + 0.01 * time))
+    assert sensing.true_voltage(model, read, time) == pytest.approx(volts, abs=1e-9)
+    effect_file.forget("creeping")
+
+
 @pytest.mark.parametrize("id_", ["bending_friction", "relaxing_hose", "rising"])
 def test_the_simulation_agrees_with_an_integrator_of_scipy(id_):
     model, n = with_(id_), BENCH.numbers()

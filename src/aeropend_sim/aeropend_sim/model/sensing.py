@@ -126,12 +126,13 @@ def read_voltage(model: Model, voltage: ScalarOrArray, time: NDArray[np.floating
     return voltage + _error(model, "v_a", time, v=voltage) + model.effect("voltage_offset", "bias")
 
 
-def true_voltage(model: Model, reading: ScalarOrArray) -> ScalarOrArray:
+def true_voltage(model: Model, reading: ScalarOrArray, time: NDArray[np.floating[Any]] | float = 0.0) -> ScalarOrArray:
     """The inverse of `read_voltage`.
 
     Args:
         model: its effect `voltage_offset` acts.
         reading: [V] scalar or (N,) voltage read.
+        time: [s] of it, for formulas that depend on it.
 
     Returns:
         [V] v - bias, in the shape of `reading`.
@@ -139,7 +140,7 @@ def true_voltage(model: Model, reading: ScalarOrArray) -> ScalarOrArray:
     first = reading - model.effect("voltage_offset", "bias")
     true = first
     for _ in range(REPEATED if "v_a" in readings_with_errors(model) else 0):
-        true = first - _error(model, "v_a", 0.0, v=true)
+        true = first - _error(model, "v_a", time, v=true)
     return true
 
 

@@ -174,7 +174,7 @@ class CutChain:
         out = np.empty((3, len(voltage[:stop])))
         for piece, whole in self.pieces(values, stop):
             m = actuator.behind_terminals(whole)
-            true = sensing.true_voltage(m, voltage[piece])
+            true = sensing.true_voltage(m, voltage[piece], self.signals.period * np.arange(len(voltage))[piece])
             part, prepared = np.full((3, len(true)), np.nan), dynamics.prepare(m, self.signals.period)
             if prepared[0].h >= SHORTEST_STEP:
                 state = dynamics.run_motor(true, state, *prepared, part)
