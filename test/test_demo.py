@@ -39,7 +39,9 @@ def test_the_hidden_effect_is_named(finished):
     code, said, complained, out = finished
     assert code == 0, said + complained
     assert "verdict: coulomb_friction (arm)" in said
-    assert said.strip().endswith("the verdict is right")
+    *_, told, what_next = said.strip().splitlines()
+    assert told.endswith("the verdict is right")
+    assert "make live" in what_next
     body = json.loads((out / "diagnosis" / "diagnosis.json").read_text())
     true = load(out / "rig.yaml").effects["coulomb_friction"]["accel"]
     found = next(c for c in body["which"]["candidates"] if c["effect"] == "coulomb_friction")

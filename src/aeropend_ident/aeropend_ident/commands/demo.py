@@ -185,6 +185,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     truth = ", ".join(f"{k} = {v:.4g}" for p in rig.effects.values() for k, v in p.items())
     hidden = f"{drawn} ({truth})" if truth else drawn
     print(f"hidden in the plant: {hidden}: the verdict is {'right' if right else 'WRONG'}")
+    print("next: make live runs the model beside a rig that changes while you look (docs/guide/live.md)")
     return 0 if right else 1
 
 
