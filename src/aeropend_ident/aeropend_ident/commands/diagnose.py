@@ -33,7 +33,7 @@ from aeropend_ident.diagnosis.validation import validate
 from aeropend_ident.result_folder import ensure_free, folder_names
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import Mounting
-from aeropend_ident.signals.variants import Variant, VariantError
+from aeropend_ident.signals.variants import SAME, Variant, VariantError
 from aeropend_ident.signals.variants import read as read_variants
 from aeropend_sim.cli import browser
 from aeropend_sim.cli.command import Parser, between, entry_point, own
@@ -42,9 +42,6 @@ from aeropend_sim.errors import UserError
 from aeropend_sim.model import effect_file
 from aeropend_sim.model.parameters import PRESETS, load
 from aeropend_sim.untrusted import printable
-
-SAME = Variant("")
-"""The rig as the model states it."""
 
 BROKEN = 1
 """Exit code if the verdict breaks a rule of `--fail-on` (convention: 1 is the answer no)."""
@@ -214,7 +211,7 @@ def run(options: argparse.Namespace, command: str, rules: Sequence[checks.Rule])
                           for bags in (options.bags, options.test))
         if of_rig is not None:
             signals = [(of_rig.mounting or Mounting()).of(s) for s in signals]
-        signals = [replace(s, variant=variants.get(bag)) for bag, s in zip(options.bags, signals, strict=True)]
+        signals = [replace(s, variant=variants.get(bag, SAME)) for bag, s in zip(options.bags, signals, strict=True)]
         found = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal, material=options.material,
                          seconds=options.seconds, known=known, further=further,
                          progress=lambda what, share: show(share, what))

@@ -35,6 +35,7 @@ from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.signals import Mounting, Signals
 from aeropend_ident.signals.statistics import Z95
+from aeropend_ident.signals.variants import SAME
 from aeropend_sim.model.effects import family
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import DUTY_MAP, MODEL_NAMES, OPTIONAL, Model
@@ -103,7 +104,7 @@ def _with_runs(row: ParameterRow, name: str, joint: JointFit) -> ParameterRow:
     """The row of a calibrated parameter, with what each of several recordings gives for it in its variant."""
     chains = joint.chains
     if name in joint.alone:
-        factors = [1.0 if s.variant is None else s.variant.factor.get(name, 1.0) for s in chains.recordings]
+        factors = [s.variant.factor.get(name, 1.0) for s in chains.recordings]
         runs = tuple(interval(x * e.value, abs(x) * e.sd) for x, e in zip(factors, joint.alone[name], strict=True))
         return replace(row, runs=runs, run_to_run=run_to_run(joint.alone[name]))
     of_each = [key(name).of(k) if key(name).of(k) in joint.values else name for k in range(len(chains.each))]
@@ -121,7 +122,7 @@ def variants(chains: CutChains, joint: JointFit) -> tuple[VariantFound, ...]:
     """
     found: dict[str, VariantFound] = {}
     for k, s in enumerate(chains.recordings):
-        if s.variant is None:
+        if s.variant == SAME:
             continue
         known = {n: interval(x * joint.values[n], abs(x) * joint.sd[n]) for n, x in s.variant.factor.items()
                  if n in joint.values}

@@ -28,14 +28,7 @@ from aeropend_ident.diagnosis.chain.hanging import mounted
 from aeropend_ident.diagnosis.chain.known import Known
 from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model
 from aeropend_ident.diagnosis.chain.pwm_timing import with_pwm_timing
-from aeropend_ident.diagnosis.chain.values import (
-    CHANNELS_OF,
-    PLACE_OF_PARAMETER,
-    neutral,
-    of_rig,
-    with_values,
-    without_variants,
-)
+from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, PLACE_OF_PARAMETER, neutral, of_rig, with_values
 from aeropend_ident.diagnosis.conclude import Statistical
 from aeropend_ident.diagnosis.document import (
     CANNOT_TELL,
@@ -280,9 +273,8 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     nominal = model if chains.policy.calibrated else with_values(model, of_rig(gaps.base))
     progress("done", 1.0)
     measured = model if chains.policy.calibrated else replace(model, sensing=_own_sensing(model, found.recordings))
-    values = without_variants(joint.values) if chains.policy.calibrated else joint.values
-    return Diagnosis(nominal, _augmented(measured, values, found.statistical), found.recordings, gaps.runs_before,
-                     gaps.runs_after, conclusions, found.misfit)
+    return Diagnosis(nominal, _augmented(measured, joint.values_of_rig, found.statistical), found.recordings,
+                     gaps.runs_before, gaps.runs_after, conclusions, found.misfit)
 
 
 def _changes_later(gaps: _Gaps) -> bool:
@@ -450,7 +442,7 @@ def _measure(fitted: CutChains, found: _Findings, joint: JointFit) -> _Gaps:
     """The gap on held-out data before and after."""
     chains, model = found.chains, found.chains.model
     # the identified parameters of an uncalibrated rig, and unknown ones of a variant, are its nominal model
-    unknown = {n for s in chains.recordings if s.variant is not None for n in s.variant.unknown}
+    unknown = {n for s in chains.recordings for n in s.variant.unknown}
     base = {n: v for f in found.stages.values() for n, v in f.base.values.items()
             if key(n).is_initial or not chains.policy.calibrated or key(n).plain in unknown}
     values: Mapping[str, float] = joint.values
@@ -485,7 +477,6 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
     undecided = conclude.not_separable(chains, stages)
     tried = EXPERIMENTS if calibrated else experiments_within(max(s.largest_duty for s in found.recordings))
     rows = conclude.parameter_rows(chains, joint)
-    values = without_variants(joint.values) if calibrated else joint.values
     closed, low, high = closure(gaps.before, gaps.after, gaps.floors)
     places = gap_share.share_of_places(parts, lambda: _parts_of_parameters(joint, gaps))
     return Conclusions(
@@ -499,7 +490,7 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
                                                                           settings.jobs),
                     tuple(conclude.names(a, b) for a, b in undecided),
                     conclude.next_experiment(chains.model, found.recordings[0], undecided,
-                                             _unlearned(values, found.learned), tried, settings.jobs),
+                                             _unlearned(joint.values_of_rig, found.learned), tried, settings.jobs),
                     _families(head.small)),
         closure=Closure(gaps.before.total, gaps.after.total, gaps.before.total_floor(gaps.floors), closed, low, high,
                         budget=gaps.budget(gust=found.statistical.gust is not None, jobs=settings.jobs)),

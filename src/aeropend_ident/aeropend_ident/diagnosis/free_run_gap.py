@@ -58,7 +58,7 @@ def free_run(model: Model, signals: Signals, values: Mapping[str, float] | None 
     out = {"theta": np.empty(len(signals)), "omega": _held_speed(run, signals), "i_a": np.empty(len(signals)),
            "v_a": np.empty(len(signals))}
     for piece, m in pieces:
-        time = signals.period * np.arange(len(signals))[piece]
+        time = signals.time[piece]
         reading = sensing.read_angle(m, run.theta, run.theta_dot, signals.period)
         out["theta"][piece] = reading[piece]
         out["i_a"][piece] = sensing.read_current(m, run.i_a[piece], time)

@@ -101,6 +101,12 @@ class JointFit:
         """All parameters by name: of the nominal model, and of the effects found."""
         return _parameters(self.chains, self.findings)
 
+    @property
+    def values_of_rig(self) -> dict[str, float]:
+        """The values without the numbers of a calibrated rig's variants, which are a recording's own."""
+        own = not self.chains.policy.calibrated
+        return {n: v for n, v in self.values.items() if own or key(n).is_initial or not key(n).recording}
+
     def without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         """The values that leave the smallest gap without some of the effects.
 

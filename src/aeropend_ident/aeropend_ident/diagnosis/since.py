@@ -89,8 +89,7 @@ def estimates(joint: JointFit, statistical: Statistical) -> Estimates:
         joint: the joint fit.
         statistical: effects that were detected by their statistics.
     """
-    own = not joint.chains.policy.calibrated  # of a calibrated rig only numbers of variants are a recording's own
-    names = [n for n in joint.values if not key(n).is_initial and (own or not key(n).recording)]
+    names = [n for n in joint.values_of_rig if not key(n).is_initial]
     of_fit = list(joint.fit.values)
     at = [of_fit.index(n) for n in names]
     covariance = covariance_of(joint.fit.information(joint.fit.ess))[np.ix_(at, at)]

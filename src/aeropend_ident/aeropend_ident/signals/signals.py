@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.signals.noise import innovation_noise, least_noise, white_noise
 from aeropend_ident.signals.outliers import far_from_median, jumps_out, saturated
 from aeropend_ident.signals.pulses import UNSURE, Pulses, find_pulses, hold
-from aeropend_ident.signals.variants import Variant
+from aeropend_ident.signals.variants import SAME, Variant
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 from aeropend_sim.wording import counted
@@ -105,7 +105,7 @@ class Signals:
         mounting: of the angle's sensor, if it was found from the motion; `theta` is right then.
         window: first sample at which effects act that the model lacks, and the first at which they act no more; None:
             they act all the time.
-        variant: of the rig in this recording; None: the rig as the model states it.
+        variant: of the rig in this recording.
     """
 
     period: float
@@ -121,7 +121,7 @@ class Signals:
     notes: tuple[str, ...] = ()
     window: tuple[int, int] | None = None
     mounting: Mounting | None = None
-    variant: Variant | None = None
+    variant: Variant = SAME
 
     def __len__(self) -> int:
         return len(self.duty)
@@ -150,6 +150,11 @@ class Signals:
         first, last = (min(k, end) for k in self.window)
         pieces = [(slice(0, first), False), (slice(first, last), True), (slice(last, end), False)]
         return [(piece, acts) for piece, acts in pieces if piece.stop > piece.start]
+
+    @cached_property
+    def time(self) -> Array:
+        """[s] (N,) Time of each sample after the first."""
+        return np.asarray(self.period * np.arange(len(self)), dtype=np.float64)
 
     @property
     def samples(self) -> int:

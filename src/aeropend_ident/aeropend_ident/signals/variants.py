@@ -42,6 +42,8 @@ class Variant:
 
     def of(self, model: Model) -> Model:
         """The model of the variant, with the unknown numbers as they are."""
+        if not self.factor:
+            return model
         return replace(model, model={n: x * self.factor.get(n, 1.0) for n, x in model.model.items()})
 
     def acting(self, values: Mapping[str, float], model: Model) -> dict[str, float]:
@@ -51,7 +53,13 @@ class Variant:
             values: of the rig, by plain names.
             model: of the rig.
         """
+        if not self.factor:
+            return dict(values)
         return {**values, **{n: factor * values.get(n, model.model[n]) for n, factor in self.factor.items()}}
+
+
+SAME = Variant("")
+"""The rig as the model states it."""
 
 
 def read(path: str | Path, bags: Sequence[str], model: Model) -> dict[str, Variant]:

@@ -114,7 +114,7 @@ class CutChain:
                 before = float(np.nan_to_num(actuator.duty(n, first)))
             v = of(n, s.duty, m.effects, s.period, start=-piece.start, before=before)
             seen = actuator.terminal_voltage(m, v[piece], self.current[piece], s.period)
-            out[piece] = sensing.read_voltage(m, seen, s.period * np.arange(len(s))[piece])
+            out[piece] = sensing.read_voltage(m, seen, s.time[piece])
         return out
 
     def actuator_residuals(self, values: Values) -> dict[str, Array]:
@@ -174,7 +174,7 @@ class CutChain:
         out = np.empty((3, len(voltage[:stop])))
         for piece, whole in self.pieces(values, stop):
             m = actuator.behind_terminals(whole)
-            true = sensing.true_voltage(m, voltage[piece], self.signals.period * np.arange(len(voltage))[piece])
+            true = sensing.true_voltage(m, voltage[piece], self.signals.time[piece])
             part, prepared = np.full((3, len(true)), np.nan), dynamics.prepare(m, self.signals.period)
             if prepared[0].h >= SHORTEST_STEP:
                 state = dynamics.run_motor(true, state, *prepared, part)
@@ -187,8 +187,7 @@ class CutChain:
         i_a, omega, angle = self.motor(values, s.train)
         residuals = {}
         if s.has("i_a"):
-            time = s.period * np.arange(s.train)
-            read = [sensing.read_current(m, i_a[piece], time[piece]) for piece, m in self.pieces(values, s.train)]
+            read = [sensing.read_current(m, i_a[piece], s.time[piece]) for piece, m in self.pieces(values, s.train)]
             residuals["i_a"] = self._train(s.i_a, np.concatenate(read)) / s.sigma["i_a"]
         if s.pulses is not None:
             p = s.pulses
@@ -205,7 +204,7 @@ class CutChain:
         if s.pulses is not None and (~s.pulses.false).sum() > 2:
             p = s.pulses.of(~s.pulses.false)
             error = p.omega - mean_speed(angle, p.time, p.period, s.period)
-            t, middle = np.arange(len(s)) * s.period, p.time - 0.5 * p.period
+            t, middle = s.time, p.time - 0.5 * p.period
             omega[s.train:] += np.interp(t[s.train:], middle, error)
             if known := int(np.searchsorted(p.index, s.train)):
                 omega[:s.train] += np.interp(t[:s.train], middle[:known], error[:known])
@@ -291,7 +290,7 @@ class CutChains:
         return out
 
     def _cut(self, signals: Signals) -> CutChain:
-        return CutChain.cut(self.model if signals.variant is None else signals.variant.of(self.model), signals)
+        return CutChain.cut(signals.variant.of(self.model), signals)
 
     def values_of(self, values: Values, k: int) -> dict[str, float]:
         """The values that act on recording k, under plain names; those of its variant."""
@@ -302,7 +301,7 @@ class CutChains:
         return self._estimates_of_each(values)[k]
 
     def _acting(self, values: Values) -> list[dict[str, float]]:
-        return [own if chain.signals.variant is None else chain.signals.variant.acting(own, self.model)
+        return [chain.signals.variant.acting(own, self.model)
                 for chain, own in zip(self.each, self._estimates_of_each(values), strict=True)]
 
     def _estimates_of_each(self, values: Values) -> list[dict[str, float]]:

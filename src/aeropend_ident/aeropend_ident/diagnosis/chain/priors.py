@@ -122,12 +122,12 @@ def model_parameters(chains: CutChains, stage: str) -> list[Parameter]:
     if chains.known is not None:
         return chains.known.parameters(stages, OUTSIDE)
     for name in (n for b in stages for n in STAGES[b]):
-        nominal, p = chains.model.model[name], PARAMETERS[f"model.{name}"]
-        if nominal > 0.0 and not calibrated:
-            parameters.append(Parameter(name, nominal, UNCALIBRATED_SD, max(p.low, 1e-12), p.high, log=True))
+        nominal, p = chains.model.model[name], limits(name)
+        if nominal != 0.0 and not calibrated:
+            parameters.append(_unknown(name, nominal))
         elif nominal != 0.0:
-            sd = (NOMINAL_SD if calibrated else UNCALIBRATED_SD) * abs(nominal)
-            reach = OUTSIDE * sd if calibrated else math.inf
+            sd = NOMINAL_SD * abs(nominal)
+            reach = OUTSIDE * sd
             parameters.append(Parameter(name, nominal, sd, max(p.low, nominal - reach), min(p.high, nominal + reach)))
     if calibrated:
         tau = chains.model.sensing[key(FILTER).name]
@@ -142,19 +142,19 @@ def model_parameters(chains: CutChains, stage: str) -> list[Parameter]:
 
 def _of_variants(p: Parameter, recordings: Sequence[Signals]) -> list[Parameter]:
     """A calibrated parameter, and one for each recording of a variant that does not know it."""
-    unknown = [s.variant is not None and p.name in s.variant.unknown for s in recordings]
+    unknown = [p.name in s.variant.unknown for s in recordings]
     if not any(unknown):
         return [p]
     own = [k for k in range(1, len(recordings)) if unknown[k] or unknown[0]]
-    return [replace(_unknown(p) if unknown[k] else p, name=key(p.name).of(k)) for k in (0, *own)]
+    return [replace(_unknown(p.name, p.mean) if unknown[k] else p, name=key(p.name).of(k)) for k in (0, *own)]
 
 
-def _unknown(p: Parameter) -> Parameter:
-    """A parameter that is known to a factor of three at best."""
-    ends = limits(p.name)
-    if p.mean > 0.0:
-        return Parameter(p.name, p.mean, UNCALIBRATED_SD, max(ends.low, 1e-12), ends.high, log=True)
-    return Parameter(p.name, p.mean, UNCALIBRATED_SD * abs(p.mean), ends.low, ends.high)
+def _unknown(name: str, nominal: float) -> Parameter:
+    """A parameter of the model that is known to a factor of three at best."""
+    p = limits(name)
+    if nominal > 0.0:
+        return Parameter(name, nominal, UNCALIBRATED_SD, max(p.low, 1e-12), p.high, log=True)
+    return Parameter(name, nominal, UNCALIBRATED_SD * abs(nominal), p.low, p.high)
 
 
 def nominal_sd(chains: CutChains, name: str) -> float:

@@ -92,11 +92,6 @@ def clipped(name: str, value: float) -> float:
     return min(max(value, p.low), p.high)
 
 
-def without_variants(values: Values) -> dict[str, float]:
-    """The values of a calibrated rig without the numbers that recordings of its variants have of their own."""
-    return {n: v for n, v in values.items() if key(n).is_initial or not key(n).recording}
-
-
 def of_rig(values: Values) -> dict[str, float]:
     """The values that hold for the rig: without initial states; those that differ between recordings as their mean."""
     out: dict[str, list[float]] = {}

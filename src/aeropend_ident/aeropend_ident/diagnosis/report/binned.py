@@ -93,7 +93,7 @@ def variable(s: Signals, name: str) -> Array:
         (N,) values.
     """
     if name == "t":
-        return np.asarray(np.arange(len(s)) * s.period)
+        return s.time
     if name == "duty":
         return s.duty
     if name == "theta_dot":

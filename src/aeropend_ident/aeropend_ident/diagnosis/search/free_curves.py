@@ -23,7 +23,6 @@ from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
 from aeropend_ident.estimation.map_fit import Fit, Search, finite
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.pulses import mean_speed
-from aeropend_ident.signals.signals import Signals
 from aeropend_ident.signals.smoothing import lag
 from aeropend_ident.signals.statistics import effective_sample_size
 from aeropend_sim.compiled import njit
@@ -272,7 +271,7 @@ class _Stage:
     def free_in_time(self, unit: str) -> Columns:
         """A term that is free in time: it shows which place fits, whatever the term depends on."""
         s = self.chain.signals
-        t = np.arange(len(s)) * s.period
+        t = s.time
         knots = np.arange(0.0, s.train * s.period + MOMENT, MOMENT)
         first = np.searchsorted(t, knots - MOMENT)
         last = np.searchsorted(t, knots + MOMENT)
@@ -303,14 +302,10 @@ def angle_response(chain: CutChain, values: Mapping[str, float], drive: Array) -
     return {"theta": arm_response(drive, stiffness, n["c_over_J"], tau, chain.signals.period)}
 
 
-def _time(s: Signals) -> Array:
-    return np.asarray(np.arange(len(s)) * s.period, dtype=np.float64)
-
-
 def _arm_variables(chain: CutChain, values: Mapping[str, float]) -> Variables:
     s = chain.signals
     theta, rate = chain.arm_motion(values)
-    return {"omega": chain.speed, "theta": theta, "theta_dot": rate, "t": _time(s),
+    return {"omega": chain.speed, "theta": theta, "theta_dot": rate, "t": s.time,
             "omega, slowly": lag(chain.speed, MEMORY, s.period),
             "slope of omega": np.gradient(lag(chain.speed, SLOPE_OVER, s.period), s.period)}
 
@@ -337,7 +332,7 @@ def _arm(stage: _Stage) -> Places:
 def _motor_variables(chain: CutChain, values: Mapping[str, float]) -> Variables:
     s = chain.signals
     i, omega, _ = chain.motor(values)
-    return {"i_a": i, "omega": omega, "t": _time(s),
+    return {"i_a": i, "omega": omega, "t": s.time,
             "theta": np.nan_to_num(lag(np.nan_to_num(s.theta), SLOPE_OVER, s.period))}
 
 
@@ -366,7 +361,7 @@ def _motor(stage: _Stage) -> Places:
 
 def _actuator_variables(chain: CutChain, values: Mapping[str, float]) -> Variables:  # noqa: ARG001
     s = chain.signals
-    return {"duty": s.duty, "i_a": np.nan_to_num(s.i_a), "t": _time(s)}
+    return {"duty": s.duty, "i_a": np.nan_to_num(s.i_a), "t": s.time}
 
 
 def _actuator(stage: _Stage) -> Places:
