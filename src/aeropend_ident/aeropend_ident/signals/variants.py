@@ -7,11 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import yaml
-
 from aeropend_ident.bags.recording import RecordingError
+from aeropend_sim import yaml_file
 from aeropend_sim.model.parameters import MODEL_NAMES, PARAMETERS, Model, load
-from aeropend_sim.untrusted import NumberLoader, load_yaml, one_line
 
 KEYS = ("recordings", "numbers", "unknown", "model")
 """What a variant may state."""
@@ -98,13 +96,7 @@ def read(path: str | Path, bags: Sequence[str], model: Model) -> dict[str, Varia
 
 
 def _tree(path: Path) -> Mapping[object, object]:
-    try:
-        tree = load_yaml(path.read_text(encoding="utf-8"), NumberLoader)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not a text file"
-        raise VariantError(f"{path}: the file of variants cannot be read: {reason}") from None
-    except yaml.YAMLError as error:
-        raise VariantError(f"{path}: not valid YAML: {one_line(str(error))}") from None
+    tree = yaml_file.read(path, "a file of variants", VariantError)
     if not isinstance(tree, Mapping) or not tree:
         raise VariantError(f"{path}: no variant in it; give each as in {EXAMPLE}")
     return tree

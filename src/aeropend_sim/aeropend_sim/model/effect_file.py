@@ -10,11 +10,12 @@ from pathlib import Path
 
 import yaml
 
+from aeropend_sim import yaml_file
 from aeropend_sim.errors import UserError
 from aeropend_sim.model.effects import CATALOGUE, DEFINED, PARAMETER_MISMATCH, PLACES, Effect, EffectParameter
 from aeropend_sim.model.forms import FORMS
 from aeropend_sim.model.formula import CONSTANTS, FUNCTIONS, QUANTITIES, FormulaError, dimension, parse
-from aeropend_sim.untrusted import NumberLoader, load_yaml, one_line, printable
+from aeropend_sim.untrusted import one_line, printable
 
 USES = {
     "actuator": ("v", "i_a", "t"), "electrical": ("i_a", "omega", "v", "t"), "rotor": ("omega", "i_a", "v", "t"),
@@ -58,19 +59,7 @@ def load(path: str | Path) -> dict[str, Effect]:
     Raises:
         EffectError: it cannot be read, or a definition cannot be used.
     """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not a text file"
-        raise EffectError(f"{path}: the effect file cannot be read: {reason}") from None
-    try:
-        tree = load_yaml(text, NumberLoader)
-    except yaml.MarkedYAMLError as error:
-        line = f" at line {error.problem_mark.line + 1}" if error.problem_mark else ""
-        raise EffectError(f"{path}: not valid YAML{line}: {one_line(str(error.problem))}") from None
-    except yaml.YAMLError as error:
-        raise EffectError(f"{path}: not an effect file: {one_line(str(error))}") from None
-    return define(tree, str(path))
+    return define(yaml_file.read(path, "an effect file", EffectError), str(path))
 
 
 def define(tree: object, where: str) -> dict[str, Effect]:
