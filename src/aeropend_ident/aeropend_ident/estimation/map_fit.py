@@ -27,6 +27,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -468,19 +469,28 @@ def within_bounds(residuals: Callable[[dict[str, float]], Residuals], parameters
     return {p.name: p.value(x) for p, x in zip(parameters, search.z, strict=True)}
 
 
+class Screened(NamedTuple):
+    """What an addition would do if the model were linear.
+
+    Attributes:
+        left: share of the weighted sum of squares that it would leave; 1 where it changes nothing.
+        values: name -> value of all parameters there.
+    """
+
+    left: float
+    values: dict[str, float]
+
+
 def screen(residuals: Callable[[dict[str, float]], Residuals], base: Fit, known: Sequence[Parameter],
-           additions: Sequence[Sequence[Parameter]], least_ess: float = 0.0) -> list[float]:
-    """Share of the misfit that each addition would leave if the model were linear: one least-squares solve each.
+           additions: Sequence[Sequence[Parameter]], least_ess: float = 0.0) -> list[Screened]:
+    """What each addition would do if the model were linear: one least-squares solve each.
 
     Args:
         residuals: as for `fit`.
         base: the fit without additions.
         known: its parameters.
-        additions: groups of parameters, each tried at its starts.
+        additions: groups of parameters, each tried at its starts; the first is a size, 0 effect at its mean.
         least_ess: as for `fit`.
-
-    Returns:
-        Share of the weighted sum of squares that is left, one an addition; 1 where nothing changes.
     """
     search = Search(residuals, started(known, base.values), least_ess)
     r = search.stack(search.current)
@@ -492,16 +502,22 @@ def screen(residuals: Callable[[dict[str, float]], Residuals], base: Fit, known:
         values = {**base.values, **{p.name: p.begin for p in group}}
         changed = {k: finite(np.asarray(x)) for k, x in residuals(values).items() if len(x)}
         column = search.stack({k: changed[k] for k in search.weight}) - r
-        size = float(column @ column)
-        if not np.isfinite(size) or size == 0.0:
-            left.append(1.0)
+        power = float(column @ column)
+        if not np.isfinite(power) or power == 0.0:
+            left.append(Screened(1.0, values))
             continue
         cross, at = np.zeros(len(search.z)), 0
         for s in slopes.values():
             cross[s.by] += s.rows @ column[at:at + s.rows.shape[1]]
             at += s.rows.shape[1]
         # a little ridge keeps the matrix regular where a known parameter does the same
-        bordered = np.block([[information, cross[:, None]], [cross, (1.0 + 1e-9) * size]])
+        bordered = np.block([[information, cross[:, None]], [cross, (1.0 + 1e-9) * power]])
         right = np.append(gradient, column @ r)
-        left.append(max(cost - float(right @ np.linalg.solve(bordered, right)), 0.0) / max(cost, 1e-300))
+        solved = np.linalg.solve(bordered, right)
+        moved = np.clip(search.z - solved[:-1], search.low, search.high)
+        size, *_ = group
+        there = min(max(size.mean - float(solved[-1]) * (size.begin - size.mean), size.low), size.high)
+        left.append(Screened(max(cost - float(right @ solved), 0.0) / max(cost, 1e-300),
+                             {**values, **{p.name: p.value(x) for p, x in zip(known, moved, strict=True)},
+                              size.name: there}))
     return left

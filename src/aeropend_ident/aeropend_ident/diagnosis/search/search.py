@@ -38,6 +38,7 @@ from aeropend_ident.diagnosis.search.selection import (
     shared,
     squared_gap,
 )
+from aeropend_ident.diagnosis.search.sets import with_best_set
 from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess, passed
 from aeropend_ident.estimation.parameter import Parameter, started
 
@@ -73,6 +74,9 @@ EVEN = 0.5
 
 Derived: an effect is then more likely than none."""
 
+
+FORMED_ANEW = 2
+"""How often the forms of the effects are chosen anew, and a better set is searched with them (choice)."""
 
 MOSTLY = 0.5
 """Share of the gap of a stage above which an effect is kept for the next round, whatever its evidence alone.
@@ -168,8 +172,22 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
         rivals = findings.found[len(supported.found)]
         findings = replace(supported, rivals=rivals, cut_short=findings.cut_short)
     if not passed(deadline):
-        findings = _with_best_forms(chains, _with_better_rivals(chains, findings, nominal), nominal)
+        if chains.policy.calibrated and chains.known is None:
+            findings = _with_best_set(chains, findings, nominal, candidates, trifle)
+        else:
+            findings = _with_best_forms(chains, _with_better_rivals(chains, findings, nominal), nominal)
     return _without_unneeded(chains, findings, nominal)
+
+
+def _with_best_set(chains: CutChains, findings: Findings, nominal: list[Parameter],
+                   candidates: Sequence[Hypothesis], trifle: float) -> Findings:
+    """The best set of effects, each in its best form beside the others; another form may lead to another set."""
+    for _ in range(FORMED_ANEW):
+        best = with_best_set(chains, findings, nominal, candidates, trifle)
+        if best is findings:
+            break
+        findings = _with_best_forms(chains, best, nominal)
+    return findings
 
 
 def _select(here: SelectionRound, findings: Findings, candidates: list[Hypothesis]

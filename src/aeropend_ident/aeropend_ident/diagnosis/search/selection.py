@@ -30,7 +30,7 @@ from aeropend_ident.diagnosis.search.hypotheses import (
     linear_parameters,
     other_forms,
 )
-from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess, passed, screen
+from aeropend_ident.estimation.map_fit import Fit, finite, fit, largest_ess, passed, screen, whittle
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.signals import CHANNELS
 from aeropend_ident.signals.statistics import effective_sample_size
@@ -125,21 +125,34 @@ class SelectionRound:
     def screened(self, candidates: list[Hypothesis]) -> FittedHypotheses:
         """The hypotheses that the linear screening leaves, each fitted for some rounds from its best start point."""
         rounds = self.chains.policy.screening_rounds
-        work = [(h, self._submit(h, rounds, start)) for h, start in self._shortlist(candidates)]
+        work = [(h, self._submit(h, rounds, start, self._better_start(h, start, linear)))
+                for h, start, linear in self._shortlist(candidates)]
         return [(h, w.result()) for h, w in work]
 
-    def _shortlist(self, candidates: list[Hypothesis]) -> list[tuple[Hypothesis, int]]:
-        """Hypotheses and the number of their best start point."""
+    def _better_start(self, h: Hypothesis, start: int, linear: Mapping[str, float]) -> Mapping[str, float] | None:
+        """The values that linear algebra leads to, if a search that starts there starts better; else None."""
+        if h.parameter or h.begun or DEFINED[h.effect].linear_in or h.effect in self.chains.model.effects:
+            return None
+        usual = {**self.current.values, **{p.name: p.begin for p in h.starts[start]}}
+        residuals = self.chains.residuals(self.stage)
+
+        def log_likelihood(values: Mapping[str, float]) -> float:
+            return sum(whittle(finite(np.asarray(r))) for r in residuals(dict(values)).values())
+
+        return linear if log_likelihood(linear) > log_likelihood(usual) else None
+
+    def _shortlist(self, candidates: list[Hypothesis]) -> list[tuple[Hypothesis, int, dict[str, float]]]:
+        """Hypotheses, the number of their best start point, and the values that linear algebra leads to from there."""
         groups = [(h, j) for h in candidates for j in range(len(h.starts))]
         left = screen(self.chains.residuals(self.stage), self.current, self.known,
                       [h.starts[j] for h, j in groups], self.chains.policy.least_ess)
-        best: dict[str, tuple[float, Hypothesis, int]] = {}
+        best: dict[str, tuple[float, Hypothesis, int, dict[str, float]]] = {}
         for (h, j), x in zip(groups, left, strict=True):
-            if h.name not in best or x < best[h.name][0]:
-                best[h.name] = (x, h, j)
-        ranked = [(h, j) for _, h, j in sorted(best.values(), key=lambda item: item[0])]
+            if h.name not in best or x.left < best[h.name][0]:
+                best[h.name] = (x.left, h, j, x.values)
+        ranked = [(h, j, values) for _, h, j, values in sorted(best.values(), key=lambda item: item[0])]
         # a parameter that is far off already explains nothing more as a mismatch; its wider prior only fits better
-        misplaced = [(h, j) for h, j in ranked[SHORTLIST:] if h.begun or self._misplaced(h)]
+        misplaced = [item for item in ranked[SHORTLIST:] if item[0].begun or self._misplaced(item[0])]
         return ranked[:SHORTLIST] + misplaced
 
     def _misplaced(self, h: Hypothesis) -> bool:

@@ -1,0 +1,341 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sets of effects of a stage, compared with each other.
+
+An effect that was found first may stand in for two others. Around a fit the residual is linear in all parameters, and
+nearly so in the size of each further effect. So the log evidence of any set of effects follows from small matrices
+(`linear_sets`), and a hill climb over sets that differ by one effect costs less than one fit. The set where it ends is
+fitted; the search goes on from there until no set is better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, neutral
+from aeropend_ident.diagnosis.policy import CALIBRATED
+from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis, Selection, adopted
+from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, from_linear, linear_parameters
+from aeropend_ident.diagnosis.search.selection import squared_gap
+from aeropend_ident.estimation.linear_sets import LinearSets
+from aeropend_ident.estimation.map_fit import Fit, finite, fit, largest_ess, prior_information, sensitivities
+from aeropend_ident.estimation.parameter import Parameter, started
+from aeropend_sim.model.effects import DEFINED
+
+Array = NDArray[np.float64]
+
+LARGEST_SET = 5
+"""Effects of a stage at most (choice: one more than its largest number of parameters that is often off)."""
+
+TRIES = 3
+"""Sets in a row that are fitted and are not better, after which the search ends (choice: the linear model errs)."""
+
+LEAST = 1.0
+"""[nats] Log evidence by which a set must be better (choice: what the log evidence of a fit is good to)."""
+
+PROMISING = 3.0
+"""[nats] Log evidence by which a set may be predicted to be worse and still be fitted.
+
+Choice: a linear model errs by as much."""
+
+SMALL = 0.01
+"""Step, in standard deviations of the prior, of the derivatives of an effect that is linear in two parameters (choice).
+
+A swing is linear in them only near the path on which it is."""
+
+
+class Term(NamedTuple):
+    """A parameter of the linear model.
+
+    Attributes:
+        parameter: with its prior.
+        column: index of the derivative of the residual.
+        now: its value where the model is linear.
+    """
+
+    parameter: Parameter
+    column: int
+    now: float
+
+
+@dataclass(frozen=True)
+class Member:
+    """An effect as a member of a set.
+
+    Attributes:
+        hypothesis: the effect.
+        terms: its parameters that are estimated, its size first.
+        beside: values of its other parameters.
+    """
+
+    hypothesis: Hypothesis
+    terms: tuple[Term, ...]
+    beside: Mapping[str, float]
+
+
+Set = tuple[Member, ...]
+
+
+class Predicted(NamedTuple):
+    """What the linear model says of a set.
+
+    Attributes:
+        log_evidence: prior odds included, up to a constant that all sets share; -inf if a size is out of its range.
+        values: name -> estimate.
+    """
+
+    log_evidence: float
+    values: dict[str, float]
+
+
+class LinearStage:
+    """The linear model of a stage around what was found in it.
+
+    Args:
+        chains: the cut chains.
+        findings: what was found.
+        nominal: parameters of the stage without effects.
+        candidates: effects that may be members of a set.
+    """
+
+    def __init__(self, chains: CutChains, findings: Findings, nominal: Sequence[Parameter],
+                 candidates: Sequence[Hypothesis]) -> None:
+        self._chains = chains
+        self._residuals = chains.residuals(findings.stage)
+        values = findings.final.values
+        self._now = self._at(values)
+        self._columns: dict[str, list[Array]] = {k: [] for k in self._now}
+        known = {p.name: replace(p, start=values[p.name])
+                 for p in [*nominal, *(p for h in findings.effects for p in h.own)]}
+        at = self._derivatives(list(known.values()))
+        self.nominal = tuple(Term(p, at[p.name], values[p.name]) for p in nominal)
+        self.found: Set = tuple(Member(h, tuple(Term(p, at[p.name], values[p.name]) for p in h.own), {})
+                                for h in findings.effects)
+        self._removed = {m.hypothesis.name: self._change(values, {**values, **self._off(m.hypothesis)})
+                         for m in self.found if not m.hypothesis.parameter}
+        self.options = tuple(self._options(findings, candidates, at))
+        f = findings.final
+        self._linear = LinearSets({k: np.vstack([*columns, self._now[k]]) for k, columns in self._columns.items()},
+                                  {k: f.ess[k] / len(r) / f.scale[k] ** 2 for k, r in self._now.items()})
+
+    def _at(self, values: Mapping[str, float]) -> dict[str, Array]:
+        return {k: finite(np.asarray(r)) for k, r in self._residuals(dict(values)).items() if len(r)}
+
+    def _add(self, column: Mapping[str, Array]) -> int:
+        for k, columns in self._columns.items():
+            columns.append(column[k])
+        return len(next(iter(self._columns.values()))) - 1
+
+    def _derivatives(self, parameters: Sequence[Parameter]) -> dict[str, int]:
+        """Name -> index of the derivative with respect to the value of a parameter."""
+        slopes = sensitivities(self._residuals, parameters)
+        at = {}
+        for j, p in enumerate(parameters):
+            unit = p.slope(p.to_standard(p.begin))
+            column = {k: np.zeros_like(r) for k, r in self._now.items()}
+            for k, s in slopes.items():
+                for row in s.rows[s.by == j]:
+                    column[k] = row / unit
+            at[p.name] = self._add(column)
+        return at
+
+    def _change(self, start: Mapping[str, float], end: Mapping[str, float], by: float = 1.0) -> int | None:
+        """Index of the change of the residual between two points, over `by`; None if there is none."""
+        before = self._now if start is end else self._at(start)
+        after = self._at(end)
+        column = {k: (after[k] - r) / by for k, r in before.items()}
+        return self._add(column) if any(np.any(x) for x in column.values()) else None
+
+    def _off(self, h: Hypothesis) -> dict[str, float]:
+        return {p.name: neutral(self._chains.model, p.name) for p in h.own}
+
+    def _options(self, findings: Findings, candidates: Sequence[Hypothesis], at: Mapping[str, int]
+                 ) -> Iterator[Member]:
+        """Each effect that was not found, with its form at each start of a search, and as it was fitted so far."""
+        values = findings.final.values
+        found = {h.name for h in findings.effects}
+        of_family = {h.family: h for h in findings.effects}
+        ranked = [x for selection in findings.selections for r in selection for x in (r, *r.others)]
+        ways = [(h, {p.name: p.begin for p in start}) for h in candidates for start in h.starts]
+        ways += [(r.hypothesis, {p.name: r.fit.values[p.name] for p in r.hypothesis.own}) for r in ranked]
+        for h, own in ways:
+            size = h.own[0]
+            if h.name in found:
+                continue
+            if h.parameter:
+                yield Member(h, tuple(Term(p, at[p.name], values[p.name]) for p in h.own if p.name in at), {})
+                continue
+            other = of_family.get(h.family)
+            start = {**values, **self._off(other)} if other else values
+            if DEFINED[h.effect].linear_in:
+                yield from self._linear_option(h, start)
+            elif own[size.name] != size.mean:
+                column = self._change(start, {**start, **own}, own[size.name] - size.mean)
+                if column is not None:
+                    yield Member(h, (Term(size, column, size.mean),), own)
+
+    def _linear_option(self, h: Hypothesis, start: Mapping[str, float]) -> Iterator[Member]:
+        """An effect in the two parameters in which it is linear."""
+        both = linear_parameters(h.effect)
+        columns = []
+        for p in both:
+            step = {q.name: SMALL * q.sd if q is p else 0.0 for q in both}
+            columns.append(self._change(start, from_linear(h.effect, {**start, **step}), SMALL * p.sd))
+        if None not in columns:
+            yield Member(h, tuple(Term(p, c, p.mean) for p, c in zip(both, columns, strict=True) if c is not None), {})
+
+    def predicted(self, members: Set) -> Predicted:
+        """What the linear model says of a set."""
+        terms = {t.parameter.name: t for t in (*self.nominal, *(t for m in members for t in m.terms))}
+        parameters = [t.parameter for t in terms.values()]
+        z = np.array([p.to_standard(t.now) for p, t in zip(parameters, terms.values(), strict=True)])
+        unit = np.array([p.slope(x) for p, x in zip(parameters, z, strict=True)])
+        fixed = [column for name, column in self._removed.items()
+                 if column is not None and all(m.hypothesis.name != name for m in members)]
+        step, log_evidence = self._linear.solve([t.column for t in terms.values()], unit, fixed, -z,
+                                                prior_information(parameters))
+        values = {p.name: p.value(x) for p, x in zip(parameters, z + step, strict=True)}
+        for m in members:
+            if m.terms[0].parameter.name not in {p.name for p in m.hypothesis.own}:
+                values = from_linear(m.hypothesis.effect, values)
+            values = {**m.beside, **values}
+        own = [p for m in members for p in m.hypothesis.own]
+        if any(not m.hypothesis.own[0].low <= values[m.hypothesis.own[0].name] <= m.hypothesis.own[0].high
+               for m in members):
+            return Predicted(-np.inf, {})
+        ends = {p.name: p for p in (*parameters, *own)}
+        within = {n: min(max(v, ends[n].low), ends[n].high) for n, v in values.items()}
+        return Predicted(log_evidence + sum(m.hypothesis.log_odds for m in members), within)
+
+    def neighbours(self, members: Set) -> Iterator[Set]:
+        """The sets with one effect less, one more, or one in place of another."""
+        smaller = [tuple(m for m in members if m is not gone) for gone in members]
+        yield from smaller
+        for some in [*smaller, members] if len(members) < LARGEST_SET else smaller:
+            families = {m.hypothesis.family for m in some}
+            yield from ((*some, m) for m in (*self.options, *self.found)
+                        if m.hypothesis.family not in families and all(m is not other for other in members))
+
+    def most_promising(self, but: set[frozenset[str]]) -> tuple[Set, Predicted] | None:
+        """The set where a hill climb from what was found ends, or else the best set beside it; None: none promises.
+
+        Args:
+            but: names of sets that are left out.
+        """
+        here, best = self.found, self.predicted(self.found)
+        least = best.log_evidence - PROMISING
+        while True:
+            there = [(self.predicted(s), s) for s in self.neighbours(here) if names(s) not in but]
+            top, members = max(there, key=lambda one: one[0].log_evidence, default=(best, here))
+            if members is here or top.log_evidence <= least:
+                return None if here is self.found else (here, best)
+            here, best, least = members, top, top.log_evidence + LEAST
+
+
+def names(members: Set) -> frozenset[str]:
+    """The names of the effects of a set."""
+    return frozenset(m.hypothesis.name for m in members)
+
+
+def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Parameter],
+                  candidates: Sequence[Hypothesis], trifle: float = 0.0) -> Findings:
+    """The findings of a stage with the set of effects that has most log evidence.
+
+    Args:
+        chains: the cut chains.
+        findings: what was found one after another.
+        nominal: parameters of the stage without effects.
+        candidates: effects that may be members of a set.
+        trifle: squared gap that a further effect must close at least.
+    """
+    begun, seen = findings, {frozenset(h.name for h in findings.effects)}
+    linear, failed = LinearStage(chains, findings, nominal, candidates), 0
+    while failed < TRIES:
+        best = linear.most_promising(seen)
+        if best is None:
+            break
+        members, there = best
+        seen.add(names(members))
+        f = _fitted(chains, findings, nominal, members, there.values)
+        further = max(len(members) - len(findings.found), 0)
+        closed = squared_gap(chains, findings.final, CHANNELS_OF[findings.stage]) - squared_gap(
+            chains, f, CHANNELS_OF[findings.stage])
+        if _gain(findings, members, f) <= LEAST or (further and closed <= further * trifle):
+            failed += 1
+            continue
+        findings = replace(findings, final=f, found=tuple(_before(findings, m.hypothesis, f) for m in members))
+        linear, failed = LinearStage(chains, findings, nominal, candidates), 0
+    if findings is begun:
+        return findings
+    kept = {h.name for h in begun.effects}
+    return replace(findings, found=tuple(
+        s if m.hypothesis.name in kept else _judged(chains, begun, findings, nominal, linear, m, s)
+        for m, s in zip(linear.found, findings.found, strict=True)))
+
+
+def _fitted(chains: CutChains, findings: Findings, nominal: Sequence[Parameter], members: Set,
+            values: Mapping[str, float]) -> Fit:
+    known = list(nominal)
+    for m in members:
+        known = adopted(known, m.hypothesis)
+    return fit(chains.residuals(findings.stage), started(known, {**findings.final.values, **values}))
+
+
+def _gain(findings: Findings, members: Set, f: Fit) -> float:
+    """Log evidence of the fit of a set over that of what was found, prior odds included."""
+    ess = largest_ess([findings.final, f])
+    return (f.log_evidence(ess) - findings.final.log_evidence(ess) + sum(m.hypothesis.log_odds for m in members)
+            - sum(h.log_odds for h in findings.effects))
+
+
+def _before(findings: Findings, h: Hypothesis, f: Fit) -> Selection:
+    """The selection in which an effect was found, with the fit of a new set; of a new effect, itself alone."""
+    for selection in findings.found:
+        if selection[0].hypothesis.name == h.name:
+            return (replace(selection[0], fit=f), *selection[1:])
+    return (RankedHypothesis(h, f, 0.0, 1.0),)
+
+
+def _judged(chains: CutChains, begun: Findings, findings: Findings, nominal: Sequence[Parameter], linear: LinearStage,
+            mine: Member, selection: Selection) -> Selection:
+    """The selection of an effect that only the comparison of sets found: its rivals are those of the best set.
+
+    Args:
+        chains: the cut chains.
+        begun: the findings before the comparison.
+        findings: the best set.
+        nominal: parameters of the stage without effects.
+        linear: the linear model around the best set.
+        mine: the effect.
+        selection: in which it is alone.
+    """
+    others = tuple(m for m in linear.found if m is not mine)
+    here, none = linear.predicted(linear.found).log_evidence, linear.predicted(others).log_evidence
+    taken = {m.hypothesis.family for m in linear.found}
+    rivals: dict[str, tuple[float, Member, Predicted]] = {}
+    for m in linear.options:
+        there = linear.predicted((*others, m))
+        if m.hypothesis.family not in taken and there.log_evidence > rivals.get(m.hypothesis.family, (-np.inf,))[0]:
+            rivals[m.hypothesis.family] = there.log_evidence, m, there
+    weight = {family: float(np.exp(min(e - here, 0.0))) for family, (e, *_) in rivals.items()}
+    total = 1.0 + sum(weight.values()) + float(np.exp(min(none - here, 0.0)))
+    ranked = {r.hypothesis.family: r for s in reversed(begun.selections) for r in reversed(s)}
+    found = []
+    for family, (e, m, there) in rivals.items():
+        p = weight[family] / total
+        if p > CALIBRATED.undecided:
+            f = _fitted(chains, findings, nominal, tuple(m if x is mine else x for x in linear.found), there.values)
+            found.append(RankedHypothesis(m.hypothesis, f, e - none, p))
+        elif family in ranked:
+            found.append(replace(ranked[family], probability=p))
+    first = replace(selection[0], gain=here - none, probability=1.0 / total)
+    was = ranked.get(mine.hypothesis.family)
+    if was is not None:
+        forms = [x for x in (was, *was.others) if x.hypothesis.name != mine.hypothesis.name]
+        first = replace(first, others=tuple(replace(x, others=(), probability=0.0) for x in forms))
+    return (first, *sorted(found, key=lambda r: -r.probability))
