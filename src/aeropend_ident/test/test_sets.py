@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sets of effects: the log evidence of a linear model, and effects that stood in for others."""
+
+import numpy as np
+import pytest
+
+from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.priors import nominal_parameters
+from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis, adopted
+from aeropend_ident.diagnosis.search.hypotheses import hypotheses
+from aeropend_ident.diagnosis.search.sets import LinearStage, names, with_best_set
+from aeropend_ident.estimation.linear_sets import LinearSets
+from aeropend_ident.estimation.map_fit import fit
+from aeropend_ident.estimation.parameter import Parameter
+from aeropend_ident.signals.signals import from_arrays
+from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
+from aeropend_sim.model import rig
+from aeropend_sim.model.parameters import SAMPLE_PERIOD
+
+N = 3000
+T = np.linspace(0.0, 1.0, N)
+COLUMNS = np.array([np.ones(N), T, np.sin(40.0 * T), np.sign(np.sin(25.0 * T))])
+
+
+def test_the_log_evidence_of_a_subset_is_that_of_its_fit():
+    y = 0.4 + 0.7 * T + 0.3 * COLUMNS[3] + np.random.default_rng(3).standard_normal(N)
+    parameters = [Parameter(f"x{j}", 0.0, 2.0) for j in range(len(COLUMNS))]
+
+    def fitted(subset):
+        return fit(lambda values: {"y": y - sum(values[f"x{j}"] * COLUMNS[j] for j in subset)},
+                   [parameters[j] for j in subset])
+
+    subsets = [(0,), (0, 1), (0, 1, 2), (0, 1, 3), (0, 1, 2, 3)]
+    fits = [fitted(s) for s in subsets]
+    ess = fits[-1].ess
+    sets = LinearSets({"y": np.vstack([-COLUMNS, y])}, {"y": ess["y"] / N})
+    for subset, f in zip(subsets, fits, strict=True):
+        found = sets.solve(subset, np.full(len(subset), 2.0), (), np.zeros(len(subset)), np.eye(len(subset)))
+        assert 2.0 * found.step == pytest.approx([f.values[f"x{j}"] for j in subset], abs=2e-2)
+        assert found.log_evidence == pytest.approx(f.log_evidence(ess), abs=0.5)
+    best = max(range(len(fits)), key=lambda k: fits[k].log_evidence(ess))
+    assert subsets[best] == (0, 1, 3)
+
+
+def test_a_column_that_is_fixed_is_added_as_it_is():
+    y = COLUMNS[1] + np.random.default_rng(4).standard_normal(N)
+    sets = LinearSets({"y": np.vstack([-COLUMNS, y])}, {"y": 1.0})
+    free = sets.solve((1,), np.ones(1), (), np.zeros(1), np.eye(1))
+    rest = sets.solve((1,), np.ones(1), (1,), np.zeros(1), np.eye(1))
+    assert rest.step == pytest.approx(free.step - 1.0, abs=2e-2)
+
+
+@pytest.fixture(scope="module")
+def chains():
+    """A rig whose thrust lags, and whose arm has drag."""
+    effects = {"thrust_lag": {"tau": 0.04}, "quadratic_drag": {"k": 0.3}}
+    columns, _ = rig.record(drawn_rig(6, effects), duty := steps(15.0, 6), 6)
+    return CutChains(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)])
+
+
+def found_alone(chains, *effects):
+    """Findings of the arm with given effects."""
+    nominal = nominal_parameters(chains, "arm")
+    candidates = {h.name: h for h in hypotheses(BENCH) if h.place in ("arm", "thrust", "sensing")
+                  and not h.parameter and h.effect not in ("gust", "speed_spikes")}
+    known = nominal
+    for name in effects:
+        known = adopted(known, candidates[name])
+    base, final = fit(chains.residuals("arm"), nominal), fit(chains.residuals("arm"), known)
+    found = tuple((RankedHypothesis(candidates[name], final, 10.0, 1.0),) for name in effects)
+    return Findings("arm", base, final, found), nominal, list(candidates.values())
+
+
+def test_the_linear_model_predicts_the_fit_of_a_set(chains):
+    findings, nominal, candidates = found_alone(chains, "thrust_lag")
+    linear = LinearStage(chains, findings, nominal, candidates)
+    members, there = linear.most_promising(set())
+    assert {"thrust_lag", "quadratic_drag"} <= names(members)
+    assert there.values["quadratic_drag.k"] == pytest.approx(0.3, rel=0.2)
+
+
+def test_effects_that_stand_in_for_others_give_way_to_them(chains):
+    findings, nominal, candidates = found_alone(chains, "encoder_lag", "axial_inflow")
+    best = with_best_set(chains, findings, nominal, candidates)
+    assert {h.name for h in best.effects} == {"thrust_lag", "quadratic_drag"}
+    assert best.final.values["thrust_lag.tau"] == pytest.approx(0.04, rel=0.1)
+    assert all(selection[0].probability > 0.9 for selection in best.found)
+    assert all(r.probability < 0.1 for selection in best.found for r in selection[1:])
+
+
+def test_the_right_set_stays_as_it_is(chains):
+    findings, nominal, candidates = found_alone(chains, "thrust_lag", "quadratic_drag")
+    assert with_best_set(chains, findings, nominal, candidates) is findings
+
+
+def test_an_effect_that_closes_less_than_a_trifle_is_not_added(chains):
+    findings, nominal, candidates = found_alone(chains, "thrust_lag")
+    best = with_best_set(chains, findings, nominal, candidates, trifle=1.0)
+    assert len(best.effects) == 1
