@@ -103,6 +103,8 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
     stages = [f.effects for f in joint.findings.values() if f.effects]
     subsets = {_names(gone): gone for effects in stages for h in effects
                for gone in ([h], _but(effects, h), effects) if gone}
+    for effects in stages:  # the others start from these
+        joint.without(effects)
     with ThreadPoolExecutor(jobs) as pool:
         found = pool.map(lambda gone: held_out.gap_of(joint.without(gone)), subsets.values())
         gaps = {frozenset(): after, **dict(zip(subsets, found, strict=True))}

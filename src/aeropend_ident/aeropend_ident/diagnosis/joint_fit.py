@@ -123,7 +123,25 @@ class JointFit:
         kept = [j for j, p in enumerate(self._bounded) if p.name not in gone or p.name in self._nominal]
         parameters = [self._back(p) if p.name in gone else p for p in (self._bounded[j] for j in kept)]
         slopes = {channel: s.of(kept) for channel, s in self._slopes.items()}
-        return within_bounds(self._of_spread, started(parameters, self.expected_without(effects)), slopes, AGAIN_STEPS)
+        start = min(self._starts_without(effects), key=self._cost)
+        return within_bounds(self._of_spread, started(parameters, start), slopes, AGAIN_STEPS)
+
+    def _starts_without(self, effects: Collection[Hypothesis]) -> list[dict[str, float]]:
+        """Where a fit without some effects may start: as if the readings were linear, or without all of their stages.
+
+        The second can be poor, but no fit may end above it: the readings may be far from linear in an effect.
+        """
+        stages = [f.effects for f in self.findings.values() if any(h in f.effects for h in effects)]
+        every = [h for of_stage in stages for h in of_stage]
+        starts = [self.expected_without(effects)]
+        if len(every) > len(effects):
+            off = {p.name: neutral(self.chains.model, p.name) for h in every if h not in effects for p in h.own[:1]}
+            starts.append({**self.values, **off, **self.without(every)})
+        return starts
+
+    def _cost(self, values: dict[str, float]) -> float:
+        """Sum of the squared residuals, in units of the channels' spread."""
+        return sum(float(r @ r) for r in self._of_spread(values).values())
 
     @cached_property
     def _nominal(self) -> dict[str, Parameter]:
