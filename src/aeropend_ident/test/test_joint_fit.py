@@ -40,6 +40,20 @@ def test_a_fit_without_an_effect_leaves_a_smaller_gap_than_the_values_beside_the
     assert np.isfinite(list(fitted.values())).all()
 
 
+def test_a_fit_without_one_effect_leaves_no_more_than_one_without_its_whole_stage():
+    """An exponent and an eccentricity stand in for each other; a linear start without the exponent is far off."""
+    effects = {"encoder_eccentricity": {"amplitude": 0.05, "phase": 0.36}, "thrust_exponent": {"n": 1.9}}
+    duty = steps(15.0, 1)
+    columns, _ = rig.record(drawn_rig(1, effects), duty, 1)
+    chains = CutChains(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)])
+    joint = fit_jointly(chains, search(chains, 2), gust=False)
+    both = joint.findings["arm"].effects
+    assert {h.effect for h in both} == set(effects)
+    held_out = HeldOut(chains, BENCH, chains.recordings, spikes=False)
+    whole = held_out.gap_of(joint.without(both)).total
+    assert all(held_out.gap_of(joint.without([h])).total < 1.1 * whole for h in both)
+
+
 def test_without_its_mismatch_a_number_is_back_within_its_tolerance():
     model = drawn_rig(80, {})
     model = Model("rig", {**model.model, "R_a": 1.4 * BENCH.model["R_a"]}, model.sensing)
