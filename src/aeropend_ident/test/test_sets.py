@@ -8,7 +8,7 @@ from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis, adopted
 from aeropend_ident.diagnosis.search.hypotheses import hypotheses
-from aeropend_ident.diagnosis.search.sets import LinearStage, names, with_best_set
+from aeropend_ident.diagnosis.search.sets import LinearStage, likely_sets, names, with_best_set
 from aeropend_ident.estimation.linear_sets import LinearSets
 from aeropend_ident.estimation.map_fit import fit
 from aeropend_ident.estimation.parameter import Parameter
@@ -91,6 +91,16 @@ def test_effects_that_stand_in_for_others_give_way_to_them(chains):
 def test_the_right_set_stays_as_it_is(chains):
     findings, nominal, candidates = found_alone(chains, "thrust_lag", "quadratic_drag")
     assert with_best_set(chains, findings, nominal, candidates) is findings
+
+
+def test_the_sets_that_are_likely_are_those_whose_fits_are(chains):
+    findings, nominal, candidates = found_alone(chains, "thrust_lag", "quadratic_drag")
+    first, *others = likely_sets(chains, findings, nominal, candidates)
+    assert set(first.effects) == {"thrust_lag", "quadratic_drag"}
+    assert first.probability + sum(s.probability for s in others) <= 1.0
+    assert [s.probability for s in others] == sorted((s.probability for s in others), reverse=True)
+    fits = [found_alone(chains, *s.effects)[0].final for s in (first, *others)]
+    assert all(f.log_evidence(first_ess := fits[0].ess) < fits[0].log_evidence(first_ess) + 3.0 for f in fits)
 
 
 def test_an_effect_that_closes_less_than_a_trifle_is_not_added(chains):

@@ -16,6 +16,7 @@ from aeropend_ident.diagnosis.chain.priors import CHOSEN, OF_THE_ARM, UNCALIBRAT
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, FILTER, STAGES, limits, neutral, of_rig, with_values
 from aeropend_ident.diagnosis.document import (
     Candidate,
+    EffectSet,
     HangingAngle,
     Identified,
     Interval,
@@ -292,6 +293,12 @@ def _closes_as_much(chains: CutChains, stage: str, findings: Findings, before: F
                 refit(chains, stage, [*beside, rival.hypothesis], values))
     open_, best, left = (squared_gap(chains, f, CHANNELS_OF[stage]) for f in fits)
     return left - best < min(MATERIAL_SHARE * (open_ - best), best)
+
+
+def sets(findings: Mapping[str, Findings]) -> tuple[EffectSet, ...]:
+    """The sets of effects that are likely, where more than one set of a stage is."""
+    return tuple(EffectSet(stage, s.effects, s.probability) for stage, f in findings.items() if len(f.sets) > 1
+                 for s in f.sets)
 
 
 def names(first: RankedHypothesis, second: RankedHypothesis) -> tuple[str, str]:

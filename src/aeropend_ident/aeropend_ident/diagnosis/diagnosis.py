@@ -491,7 +491,7 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
                     tuple(conclude.names(a, b) for a, b in undecided),
                     conclude.next_experiment(chains.model, found.recordings[0], undecided,
                                              _unlearned(joint.values_of_rig, found.learned), tried, settings.jobs),
-                    _families(head.small)),
+                    _families(head.small), conclude.sets(stages)),
         closure=Closure(gaps.before.total, gaps.after.total, gaps.before.total_floor(gaps.floors), closed, low, high,
                         budget=gaps.budget(gust=found.statistical.gust is not None, jobs=settings.jobs)),
         identified=None if calibrated else conclude.identified_model(chains, joint, rows),

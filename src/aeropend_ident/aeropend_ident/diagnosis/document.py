@@ -287,6 +287,21 @@ def _ros_text(value: Setting) -> str:
 
 
 @dataclass(frozen=True)
+class EffectSet:
+    """A set of effects that explains a stage of the chain.
+
+    Attributes:
+        stage: of the chain: "actuator", "motor" or "arm".
+        effects: ids of the effects; a parameter that is far off as "parameter_mismatch:PARAMETER".
+        probability: [0..1] among sets that differ by one effect.
+    """
+
+    stage: str
+    effects: tuple[str, ...]
+    probability: float
+
+
+@dataclass(frozen=True)
 class Which:
     """Which effect causes the gap.
 
@@ -301,6 +316,7 @@ class Which:
         unknown: an effect that the catalogue does not hold; null if there is none.
         not_separable: pairs of hypotheses that the recordings cannot separate.
         next_experiment: what to record next; null if nothing is open.
+        sets: sets of effects that are likely, where more than one set of a stage is; the likeliest of a stage first.
     """
 
     verdict: str
@@ -313,6 +329,7 @@ class Which:
     not_separable: tuple[tuple[str, str], ...]
     next_experiment: NextExperiment | None
     small: tuple[str, ...] = ()
+    sets: tuple[EffectSet, ...] = ()
 
 
 @dataclass(frozen=True)

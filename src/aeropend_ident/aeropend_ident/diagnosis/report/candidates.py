@@ -5,8 +5,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import groupby
 
-from aeropend_ident.diagnosis.document import CANNOT_TELL, Candidate, DiagnosisDocument, Interval, NextExperiment
+from aeropend_ident.diagnosis.document import (
+    CANNOT_TELL,
+    Candidate,
+    DiagnosisDocument,
+    EffectSet,
+    Interval,
+    NextExperiment,
+)
 from aeropend_ident.diagnosis.policy import CALIBRATED
 from aeropend_ident.diagnosis.report.number_format import interval, minus, percent, probability, quantity, with_unit
 from aeropend_ident.diagnosis.report.sentence import NONE, SAME_END
@@ -92,6 +100,7 @@ class Candidates:
         others: rows that a click shows.
         nothing: why nothing was tried; "" if something was.
         not_separable: pairs that concern the verdict.
+        sets: the sets of effects of a stage that are likely, a list a stage.
         advice: the next experiment.
     """
 
@@ -99,6 +108,7 @@ class Candidates:
     others: list[CandidateRow]
     nothing: str
     not_separable: list[OpenPair]
+    sets: list[list[EffectSet]]
     advice: NextExperiment | None
 
 
@@ -149,7 +159,8 @@ def section(document: DiagnosisDocument, candidates: list[CandidateRow]) -> Cand
         "No effect was tried, since the nominal model could not be identified." if document.which.verdict == CANNOT_TELL
         else "No effect was tried: refitted parameters leave too little of the gap.")
     pairs = [OpenPair(pair, _how_close(document, pair)) for pair in open_pairs(document)]
-    return Candidates(shown, others, nothing, pairs, document.which.next_experiment if pairs else None)
+    sets = [list(of_stage) for _, of_stage in groupby(document.which.sets, lambda s: s.stage)]
+    return Candidates(shown, others, nothing, pairs, sets, document.which.next_experiment if pairs else None)
 
 
 def why_lost(document: DiagnosisDocument, c: Candidate) -> str:

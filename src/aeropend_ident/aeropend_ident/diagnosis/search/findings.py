@@ -36,6 +36,14 @@ class RankedHypothesis:
         return {**first, **{r.hypothesis.effect: r.probability for r in self.others}} if self.others else {}
 
 
+@dataclass(frozen=True)
+class LikelySet:
+    """A set of effects of a stage: their ids or names, and its probability among sets that differ by one effect."""
+
+    effects: tuple[str, ...]
+    probability: float
+
+
 Selection = tuple[RankedHypothesis, ...]
 """The hypotheses of one selection round, the best first."""
 
@@ -51,6 +59,7 @@ class Findings:
         found: a selection for each effect found, in the order found; its first entry is the effect.
         rivals: the selection in which nothing was found.
         cut_short: the search was ended by its budget.
+        sets: the sets of effects that are likely, the best first; empty if sets were not compared.
     """
 
     stage: str
@@ -59,6 +68,7 @@ class Findings:
     found: tuple[Selection, ...] = ()
     rivals: Selection = ()
     cut_short: bool = False
+    sets: tuple[LikelySet, ...] = ()
 
     @property
     def effects(self) -> list[Hypothesis]:
@@ -72,12 +82,13 @@ class Findings:
 
     def without(self, selection: Selection, final: Fit | None = None) -> Findings:
         """The findings without one of the effects; `final`: the fit of the others."""
-        return replace(self, found=tuple(s for s in self.found if s is not selection), final=final or self.final)
+        return replace(self, found=tuple(s for s in self.found if s is not selection), final=final or self.final,
+                       sets=())
 
     def nothing(self) -> Findings:
         """The findings with all effects taken back; those of the first round stay as what was tried."""
         tried = tuple(replace(r, probability=0.0) for r in (self.found[0] if self.found else self.rivals))
-        return replace(self, found=(), rivals=tried, final=self.base)
+        return replace(self, found=(), rivals=tried, final=self.base, sets=())
 
 
 def adopted(known: list[Parameter], hypothesis: Hypothesis, start: int = 0) -> list[Parameter]:

@@ -38,7 +38,7 @@ from aeropend_ident.diagnosis.search.selection import (
     shared,
     squared_gap,
 )
-from aeropend_ident.diagnosis.search.sets import with_best_set
+from aeropend_ident.diagnosis.search.sets import likely_sets, with_best_set
 from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess, passed
 from aeropend_ident.estimation.parameter import Parameter, started
 
@@ -176,7 +176,10 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
             findings = _with_best_set(chains, findings, nominal, candidates, trifle)
         else:
             findings = _with_best_forms(chains, _with_better_rivals(chains, findings, nominal), nominal)
-    return _without_unneeded(chains, findings, nominal)
+    findings = _without_unneeded(chains, findings, nominal)
+    if findings.found and chains.policy.calibrated and not passed(deadline):
+        findings = replace(findings, sets=likely_sets(chains, findings, nominal, candidates))
+    return findings
 
 
 def _with_best_set(chains: CutChains, findings: Findings, nominal: list[Parameter],

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, neutral
 from aeropend_ident.diagnosis.policy import CALIBRATED
-from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis, Selection, adopted
+from aeropend_ident.diagnosis.search.findings import Findings, LikelySet, RankedHypothesis, Selection, adopted
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, from_linear, linear_parameters
 from aeropend_ident.diagnosis.search.selection import squared_gap
 from aeropend_ident.estimation.linear_sets import LinearSets
@@ -235,6 +235,32 @@ class LinearStage:
             if members is here or top.log_evidence <= least:
                 return None if here is self.found else (here, best)
             here, best, least = members, top, top.log_evidence + LEAST
+
+
+def likely_sets(chains: CutChains, findings: Findings, nominal: Sequence[Parameter],
+                candidates: Sequence[Hypothesis]) -> tuple[LikelySet, ...]:
+    """The sets of effects that are likely: of what was found, and of sets that differ by one effect.
+
+    Sets that differ in the form of an effect are one, with the form that is likeliest.
+
+    Args:
+        chains: the cut chains.
+        findings: of a stage.
+        nominal: parameters of the stage without effects.
+        candidates: effects that may be members of a set.
+    """
+    linear = LinearStage(chains, findings, nominal, candidates)
+    found: dict[frozenset[str], tuple[float, Set]] = {}
+    for members in (linear.found, *linear.neighbours(linear.found)):
+        effects, there = frozenset(m.hypothesis.family for m in members), linear.predicted(members).log_evidence
+        if there > found.get(effects, (-np.inf,))[0]:
+            found[effects] = there, members
+    log_evidence = np.array([e for e, _ in found.values()])
+    weights = np.exp(log_evidence - log_evidence.max())
+    likely = [LikelySet(tuple(m.hypothesis.family for m in members), float(p))
+              for (_, members), p in zip(found.values(), weights / weights.sum(), strict=True)
+              if p > CALIBRATED.undecided]
+    return tuple(sorted(likely, key=lambda s: -s.probability))
 
 
 def names(members: Set) -> frozenset[str]:
