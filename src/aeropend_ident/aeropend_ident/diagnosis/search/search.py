@@ -171,13 +171,15 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
     if len(findings.found) > len(supported.found):
         rivals = findings.found[len(supported.found)]
         findings = replace(supported, rivals=rivals, cut_short=findings.cut_short)
+    # one effect that explains all stands in for no others
+    several = chains.policy.calibrated and (len(findings.found) > 1 or not passes_as_noise(findings.final, MATERIAL))
     if not passed(deadline):
-        if chains.policy.calibrated and chains.known is None:
+        if several and chains.known is None:
             findings = _with_best_set(chains, findings, nominal, candidates, trifle)
         else:
             findings = _with_best_forms(chains, _with_better_rivals(chains, findings, nominal), nominal)
     findings = _without_unneeded(chains, findings, nominal)
-    if findings.found and chains.policy.calibrated and not passed(deadline):
+    if findings.found and several and not passed(deadline):
         findings = replace(findings, sets=likely_sets(chains, findings, nominal, candidates))
     return findings
 
