@@ -30,7 +30,7 @@ from aeropend_sim.model.effects import DEFINED
 Array = NDArray[np.float64]
 
 LARGEST_SET = 5
-"""Effects of a stage at most (choice: one more than its largest number of parameters that is often off)."""
+"""Effects of a stage at most (choice: two more than are searched one after another)."""
 
 TRIES = 3
 """Sets in a row that are fitted and are not better, after which the search ends (choice: the linear model errs)."""
@@ -300,7 +300,7 @@ def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Param
         return findings
     kept = {h.name for h in begun.effects}
     return replace(findings, found=tuple(
-        s if m.hypothesis.name in kept else _judged(chains, begun, findings, nominal, linear, m, s)
+        s if m.hypothesis.name in kept else _with_rivals(chains, begun, findings, nominal, linear, m, s)
         for m, s in zip(linear.found, findings.found, strict=True)))
 
 
@@ -327,8 +327,8 @@ def _before(findings: Findings, h: Hypothesis, f: Fit) -> Selection:
     return (RankedHypothesis(h, f, 0.0, 1.0),)
 
 
-def _judged(chains: CutChains, begun: Findings, findings: Findings, nominal: Sequence[Parameter], linear: LinearStage,
-            mine: Member, selection: Selection) -> Selection:
+def _with_rivals(chains: CutChains, begun: Findings, findings: Findings, nominal: Sequence[Parameter],
+                 linear: LinearStage, mine: Member, selection: Selection) -> Selection:
     """The selection of an effect that only the comparison of sets found: its rivals are those of the best set.
 
     Args:
