@@ -58,6 +58,7 @@ class Part:
         amount: squared gap, in units of the spread squared.
         windows: (W,) the same over each window of the bootstrap.
         unsure: relative standard deviation of the size of the effect.
+        ends: least and most that it may be, as effects stand in for each other.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Part:
     amount: float
     windows: Array
     unsure: float = 0.0
+    ends: tuple[float, float] = (math.inf, -math.inf)
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,8 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
     An effect that is taken out of all leaves a gap; one that alone is put in closes a gap. Where effects of a stage
     stand in for each other, the first is too small and the second too large: the part is the mean of both (of two
     effects their value of L. Shapley, 1953). Parts are scaled so that their sum is what comes back without all of them.
+    The ends of a part are the least and the most of these two, and of what the effect alone closes without those of
+    other stages too.
 
     Args:
         joint: the joint fit.
@@ -101,8 +105,9 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
     after = held_out.gap_of(joint.values)
 
     stages = [f.effects for f in joint.findings.values() if f.effects]
+    every = [h for effects in stages for h in effects]
     subsets = {_names(gone): gone for effects in stages for h in effects
-               for gone in ([h], _but(effects, h), effects) if gone}
+               for gone in ([h], _but(effects, h), effects, _but(every, h), every) if gone}
     for effects in stages:  # the others start from these
         joint.without(effects)
     with ThreadPoolExecutor(jobs) as pool:
@@ -112,15 +117,19 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
     def gap(effects: Sequence[Hypothesis]) -> Gap:
         return gaps[_names(effects)]
 
-    def part(effect: Hypothesis, with_: Gap, without: Gap) -> Part:
+    def part(effect: Hypothesis, effects: Sequence[Hypothesis]) -> Part:
         size = effect.own[0].name
         distance = abs(joint.values[size] - neutral(held_out.model, size))
-        return _coming_back(effect.name, effect.place, without, with_,
-                            min(joint.sd[size] / max(distance, 1e-300), LARGEST_UNSURE))
+        unsure = min(joint.sd[size] / max(distance, 1e-300), LARGEST_UNSURE)
+        last, first, alone = (_coming_back(effect.name, effect.place, gap(without), gap(with_), unsure)
+                              for without, with_ in (([effect], []), (effects, _but(effects, effect)),
+                                                     (every, _but(every, effect))))
+        amounts = [p.amount for p in (last, first, alone)]
+        return replace(last, amount=0.5 * (last.amount + first.amount), windows=0.5 * (last.windows + first.windows),
+                       ends=(min(amounts), max(amounts)))
 
     return [p for effects in stages for p in _adding_up(
-        [_mean(part(h, after, gap([h])), part(h, gap(_but(effects, h)), gap(effects))) for h in effects],
-        squared(gap(effects)) - squared(after))]
+        [part(h, effects) for h in effects], squared(gap(effects)) - squared(after))]
 
 
 def _names(effects: Sequence[Hypothesis]) -> frozenset[str]:
@@ -129,10 +138,6 @@ def _names(effects: Sequence[Hypothesis]) -> frozenset[str]:
 
 def _but(effects: Sequence[Hypothesis], one: Hypothesis) -> list[Hypothesis]:
     return [h for h in effects if h is not one]
-
-
-def _mean(one: Part, other: Part) -> Part:
-    return replace(one, amount=0.5 * (one.amount + other.amount), windows=0.5 * (one.windows + other.windows))
 
 
 def _adding_up(parts: Sequence[Part], together: float) -> list[Part]:
@@ -202,11 +207,11 @@ def shares(parts: Sequence[Part], *, shared: float = SHARED, seed: int = 0) -> d
     The interval holds the scatter over time (block bootstrap, H. Künsch, 1989) and the uncertainty of the size. It also
     holds what is unexplained: its direction is unknown, so that some of it may belong to each effect, or some of the
     effect to it. False captures have the whole gap that they make: those that are known are left out of the gap of all
-    others.
+    others. It reaches to the ends of a part.
 
     Args:
         parts: of the gap.
-        shared: as `SHARED`; 0 leaves out what is unexplained.
+        shared: as `SHARED`; 0 leaves out what is unexplained, and the ends.
         seed: of the bootstrap.
     """
     captures = {p.name: Interval(1.0, 1.0, 1.0) for p in parts if p.name == CAPTURES and p.amount > 0.0}
@@ -232,7 +237,9 @@ def shares(parts: Sequence[Part], *, shared: float = SHARED, seed: int = 0) -> d
     for p, low, high in zip(parts, *ends, strict=True):
         if p.name:
             share = p.amount / total
-            found[p.name] = Interval(share, min(float(low), share), min(max(float(high), share), 1.0))
+            least, most = (end / total for end in p.ends) if shared else (share, share)
+            found[p.name] = Interval(share, max(min(float(low), share, least), -1.0),
+                                     min(max(float(high), share, most), 1.0))
     return found
 
 
