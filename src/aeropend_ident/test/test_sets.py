@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sets of effects: the log evidence of a linear model, and effects that stood in for others."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis, adopted
 from aeropend_ident.diagnosis.search.hypotheses import hypotheses
+from aeropend_ident.diagnosis.search.search import _without_unneeded
 from aeropend_ident.diagnosis.search.sets import LinearStage, likely_sets, names, with_best_set
 from aeropend_ident.estimation.linear_sets import LinearSets
 from aeropend_ident.estimation.map_fit import fit
@@ -67,7 +70,8 @@ def found_alone(chains, *effects):
     for name in effects:
         known = adopted(known, candidates[name])
     base, final = fit(chains.residuals("arm"), nominal), fit(chains.residuals("arm"), known)
-    found = tuple((RankedHypothesis(candidates[name], final, 10.0, 1.0),) for name in effects)
+    found = tuple((RankedHypothesis(candidates[name], fit(chains.residuals("arm"), adopted(nominal, candidates[name])),
+                                    10.0, 1.0),) for name in effects)
     return Findings("arm", base, final, found), nominal, list(candidates.values())
 
 
@@ -103,7 +107,16 @@ def test_the_sets_that_are_likely_are_those_whose_fits_are(chains):
     assert all(f.log_evidence(first_ess := fits[0].ess) < fits[0].log_evidence(first_ess) + 3.0 for f in fits)
 
 
-def test_an_effect_that_closes_less_than_a_trifle_is_not_added(chains):
-    findings, nominal, candidates = found_alone(chains, "thrust_lag")
-    best = with_best_set(chains, findings, nominal, candidates, trifle=1.0)
-    assert len(best.effects) == 1
+def test_an_effect_that_closes_less_than_a_trifle_is_taken_out(chains):
+    findings, nominal, _ = found_alone(chains, "thrust_lag", "quadratic_drag")
+    assert len(_without_unneeded(chains, findings, nominal, 0.0).effects) == 2
+    assert len(_without_unneeded(chains, findings, nominal, 1.0).effects) == 1
+
+
+def test_a_search_that_starts_from_the_wrong_lag_ends_at_the_right_one(chains):
+    """No small step leads from one to the other, but a contender of the first round is a start too."""
+    wrong, nominal, candidates = found_alone(chains, "encoder_lag", "quadratic_drag")
+    right, *_ = found_alone(chains, "thrust_lag")
+    findings = replace(wrong, found=((wrong.found[0][0], right.found[0][0]), wrong.found[1]))
+    best = with_best_set(chains, findings, nominal, candidates)
+    assert {h.name for h in best.effects} == {"thrust_lag", "quadratic_drag"}

@@ -69,6 +69,9 @@ BETTER_ALONE = 1.0
 
 Measured: at ±30 % no verdict of 22 recordings changes (docs/results/thresholds.md)."""
 
+UNNEEDED = 1e9
+"""[nats] Log evidence by which an effect that closes a trifle counts as unneeded (choice: more than any evidence)."""
+
 EVEN = 0.5
 """Probability of all hypotheses of a round together above which an effect is found.
 
@@ -175,20 +178,20 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
     several = chains.policy.calibrated and (len(findings.found) > 1 or not passes_as_noise(findings.final, MATERIAL))
     if not passed(deadline):
         if several and chains.known is None:
-            findings = _with_best_set(chains, findings, nominal, candidates, trifle)
+            findings = _with_best_set(chains, findings, nominal, candidates)
         else:
             findings = _with_best_forms(chains, _with_better_rivals(chains, findings, nominal), nominal)
-    findings = _without_unneeded(chains, findings, nominal)
+    findings = _without_unneeded(chains, findings, nominal, trifle)
     if findings.found and several and not passed(deadline):
         findings = replace(findings, sets=likely_sets(chains, findings, nominal, candidates))
     return findings
 
 
 def _with_best_set(chains: CutChains, findings: Findings, nominal: list[Parameter],
-                   candidates: Sequence[Hypothesis], trifle: float) -> Findings:
+                   candidates: Sequence[Hypothesis]) -> Findings:
     """The best set of effects, each in its best form beside the others; another form may lead to another set."""
     for _ in range(FORMED_ANEW):
-        best = with_best_set(chains, findings, nominal, candidates, trifle)
+        best = with_best_set(chains, findings, nominal, candidates)
         if best is findings:
             break
         findings = _with_best_forms(chains, best, nominal)
@@ -332,12 +335,15 @@ def _alike(chains: CutChains, findings: Findings, f: Fit) -> bool:
             and squared_gap(chains, findings.final) <= ALIKE * squared_gap(chains, f))
 
 
-def _without_unneeded(chains: CutChains, findings: Findings, nominal: list[Parameter]) -> Findings:
-    """Take out effects found early that are not needed beside those found later."""
+def _without_unneeded(chains: CutChains, findings: Findings, nominal: list[Parameter], trifle: float) -> Findings:
+    """Take out effects that are not needed beside the others, and those that close no more than a trifle."""
     def without(now: Findings, h: Hypothesis) -> Fit:
         return fit(chains.residuals(now.stage), started(_beside(now, nominal, h), now.final.values))
 
     def lost(now: Findings, f: Fit) -> float:
+        closes = squared_gap(chains, f, CHANNELS_OF[now.stage]) - squared_gap(chains, now.final, CHANNELS_OF[now.stage])
+        if closes <= trifle and not at_end_of_prior(chains, now.stage, f):
+            return closes - UNNEEDED
         ess = largest_ess([now.final, f])
         return now.final.log_evidence(ess) - f.log_evidence(ess)
 

@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
-from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, neutral
+from aeropend_ident.diagnosis.chain.values import neutral
 from aeropend_ident.diagnosis.policy import CALIBRATED
 from aeropend_ident.diagnosis.search.findings import Findings, LikelySet, RankedHypothesis, Selection, adopted
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, from_linear, linear_parameters
-from aeropend_ident.diagnosis.search.selection import squared_gap
+from aeropend_ident.diagnosis.search.selection import CONTENDERS
 from aeropend_ident.estimation.linear_sets import LinearSets
 from aeropend_ident.estimation.map_fit import Fit, finite, fit, largest_ess, prior_information, sensitivities
 from aeropend_ident.estimation.parameter import Parameter, started
@@ -269,17 +269,40 @@ def names(members: Set) -> frozenset[str]:
 
 
 def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Parameter],
-                  candidates: Sequence[Hypothesis], trifle: float = 0.0) -> Findings:
+                  candidates: Sequence[Hypothesis]) -> Findings:
     """The findings of a stage with the set of effects that has most log evidence.
+
+    The search starts from what was found, and from each contender of the first round alone: a lag of the thrust and one
+    of the reading, say, are far from linear, and no small step leads from one to the other.
 
     Args:
         chains: the cut chains.
         findings: what was found one after another.
         nominal: parameters of the stage without effects.
         candidates: effects that may be members of a set.
-        trifle: squared gap that a further effect must close at least.
     """
-    begun, seen = findings, {frozenset(h.name for h in findings.effects)}
+    found = {h.name for h in findings.effects}
+    alone = [r for r in findings.selections[0][:CONTENDERS] if {r.hypothesis.name} != found
+             and r.fit.residuals.keys() == findings.base.residuals.keys()
+             and r.fit.values.keys() == {p.name for p in adopted(list(nominal), r.hypothesis)}]
+    seen: set[frozenset[str]] = set()
+    best = findings
+    for start in (findings, *(replace(findings, found=((r,),), final=r.fit) for r in alone)):
+        there = _climbed(chains, start, nominal, candidates, seen)
+        if _gain(best, there.effects, there.final) > LEAST:
+            best = there
+    if best is findings:
+        return findings
+    linear = LinearStage(chains, best, nominal, candidates)
+    return replace(best, rivals=findings.rivals, found=tuple(
+        s if m.hypothesis.name in found else _with_rivals(chains, findings, best, nominal, linear, m, s)
+        for m, s in zip(linear.found, best.found, strict=True)))
+
+
+def _climbed(chains: CutChains, findings: Findings, nominal: Sequence[Parameter], candidates: Sequence[Hypothesis],
+             seen: set[frozenset[str]]) -> Findings:
+    """The best set that is reached from a start; `seen`: names of the sets that were fitted, which it extends."""
+    seen.add(frozenset(h.name for h in findings.effects))
     linear, failed = LinearStage(chains, findings, nominal, candidates), 0
     while failed < TRIES:
         best = linear.most_promising(seen)
@@ -288,20 +311,12 @@ def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Param
         members, there = best
         seen.add(names(members))
         f = _fitted(chains, findings, nominal, members, there.values)
-        further = max(len(members) - len(findings.found), 0)
-        closed = squared_gap(chains, findings.final, CHANNELS_OF[findings.stage]) - squared_gap(
-            chains, f, CHANNELS_OF[findings.stage])
-        if _gain(findings, members, f) <= LEAST or (further and closed <= further * trifle):
+        if _gain(findings, [m.hypothesis for m in members], f) <= LEAST:
             failed += 1
             continue
         findings = replace(findings, final=f, found=tuple(_before(findings, m.hypothesis, f) for m in members))
         linear, failed = LinearStage(chains, findings, nominal, candidates), 0
-    if findings is begun:
-        return findings
-    kept = {h.name for h in begun.effects}
-    return replace(findings, found=tuple(
-        s if m.hypothesis.name in kept else _with_rivals(chains, begun, findings, nominal, linear, m, s)
-        for m, s in zip(linear.found, findings.found, strict=True)))
+    return findings
 
 
 def _fitted(chains: CutChains, findings: Findings, nominal: Sequence[Parameter], members: Set,
@@ -312,10 +327,10 @@ def _fitted(chains: CutChains, findings: Findings, nominal: Sequence[Parameter],
     return fit(chains.residuals(findings.stage), started(known, {**findings.final.values, **values}))
 
 
-def _gain(findings: Findings, members: Set, f: Fit) -> float:
+def _gain(findings: Findings, effects: Sequence[Hypothesis], f: Fit) -> float:
     """Log evidence of the fit of a set over that of what was found, prior odds included."""
     ess = largest_ess([findings.final, f])
-    return (f.log_evidence(ess) - findings.final.log_evidence(ess) + sum(m.hypothesis.log_odds for m in members)
+    return (f.log_evidence(ess) - findings.final.log_evidence(ess) + sum(h.log_odds for h in effects)
             - sum(h.log_odds for h in findings.effects))
 
 
