@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The model beside the rig, without ROS: residuals, detection, interruptions."""
 
+import copyreg
 import math
+from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
+from numba.typed import List
 
 from aeropend_ident.commands import live
 from aeropend_ident.live import false_alarms
@@ -24,6 +27,8 @@ from aeropend_sim.model.rig import Rig
 PERIOD_NS = round(SAMPLE_PERIOD * 1e9)
 BEFORE, AFTER = 74.0, 20.0  # s: learned, and watched; the rotor turns when the effect begins
 STEP = 25
+LEARNED = round(BEFORE / SAMPLE_PERIOD) // STEP * STEP
+copyreg.pickle(List, lambda members: (List, (list(members),)))  # so that a watcher can be copied
 
 
 @cache
@@ -42,16 +47,26 @@ def readings(effect: str, parameter: str, size: float) -> tuple[np.ndarray, np.n
     return duty, np.hstack([before, other.run(duty[first:])[0]])
 
 
+@cache
+def learned() -> Watcher:
+    """A watcher that has seen what each of the rigs does before anything begins, and has given no alarm."""
+    watcher = Watcher(load("bench"))
+    assert not fed(watcher, *readings("", "", 0.0), stop=LEARNED)
+    return watcher
+
+
 def watched(duty: np.ndarray, read: np.ndarray) -> tuple[Watcher, list[float]]:
     """A watcher that has seen it all, and the times of its alarms."""
-    watcher = Watcher(load("bench"))
-    return watcher, fed(watcher, duty, read)
+    before = slice(LEARNED)
+    assert np.array_equal(read[:, before], readings("", "", 0.0)[1][:, before])
+    watcher = deepcopy(learned())
+    return watcher, fed(watcher, duty, read, start=LEARNED)
 
 
-def fed(watcher: Watcher, duty: np.ndarray, read: np.ndarray) -> list[float]:
-    """Times of the alarms of a watcher that sees this."""
+def fed(watcher: Watcher, duty: np.ndarray, read: np.ndarray, start: int = 0, stop: int | None = None) -> list[float]:
+    """Times of the alarms of a watcher that sees this, or the samples from `start` to `stop`."""
     alarms = []
-    for k in range(0, len(duty) - STEP, STEP):
+    for k in range(start, len(duty) - STEP if stop is None else stop, STEP):
         s = slice(k, k + STEP)
         batch = Batch(PERIOD_NS * np.arange(k + 1, k + STEP + 1), Samples(*read[:, s], duty[s]))
         if watcher.step(batch)[1] is not None:
