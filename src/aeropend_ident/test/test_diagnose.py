@@ -21,7 +21,7 @@ KEYS = ["format", "bags", "model", "duration_s", "samples", "train_s", "held_out
 
 
 COMMAND = Command("aeropend_ident.commands.diagnose")
-run, refused = COMMAND.run, COMMAND.refused
+run, here, refused = COMMAND.run, COMMAND.here, COMMAND.refused
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +137,7 @@ def test_the_preset_is_a_model_of_itself(tmp_path, bags):
     duty = steps(20.0, 12)
     columns, _ = rig.record(BENCH, duty, 12)
     path = bags.write(tmp_path / "own", bags.content(len(duty), columns={**columns, "duty": duty}))
-    assert run(path, "--out", tmp_path / "out").stdout.startswith("verdict: none")
+    assert here(path, "--out", tmp_path / "out").stdout.startswith("verdict: none")
     body = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert body["shrink"]["gap"] < 1.5 * body["shrink"]["floor"]
     assert np.isfinite(body["seconds"])
@@ -153,7 +153,7 @@ def test_the_verdict_does_not_depend_on_the_number_of_threads(tmp_path, bags):
         paths.append(bags.write(tmp_path / f"bag{seed}", bags.content(len(duty), columns={**columns, "duty": duty})))
     found = []
     for jobs in (1, 3):
-        result = run(*paths, "--out", tmp_path / f"out{jobs}", "--jobs", jobs)
+        result = here(*paths, "--out", tmp_path / f"out{jobs}", "--jobs", jobs)
         assert result.returncode == 0, result.stderr
         body = json.loads((tmp_path / f"out{jobs}" / "diagnosis.json").read_text())
         body.pop("seconds")
@@ -172,7 +172,7 @@ def test_what_one_recording_says_is_shown_on_others(tmp_path, bags):
         columns, _ = rig.record(of, duty, len(paths))
         paths.append(bags.write(tmp_path / name, bags.content(len(duty), columns={**columns, "duty": duty})))
     fitted, same, different = paths
-    result = run(fitted, "--test", same, "--test", different, "--out", tmp_path / "out")
+    result = here(fitted, "--test", same, "--test", different, "--out", tmp_path / "out")
     assert result.returncode == 0, result.stderr
     body = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert list(body) == KEYS
@@ -189,7 +189,7 @@ def test_what_one_recording_says_is_shown_on_others(tmp_path, bags):
     assert [str(p) in line for p, line in zip((same, different), lines)] == [True, True]
     assert f"{100 * first['gap']:.1f} %" in lines[0]
     # what is fitted does not change by being shown
-    plain = run(fitted, "--out", tmp_path / "plain")
+    plain = here(fitted, "--out", tmp_path / "plain")
     assert plain.returncode == 0, plain.stderr
     alone = json.loads((tmp_path / "plain" / "diagnosis.json").read_text())
     assert "across" not in alone["shrink"]

@@ -18,7 +18,7 @@ KEYS = ["format", "method", "terms", "equations", "sigma", "held_out_mse", "seco
 
 
 COMMAND = Command("aeropend_ident.commands.identify")
-run, refused = COMMAND.run, COMMAND.refused
+run, here, refused = COMMAND.run, COMMAND.here, COMMAND.refused
 
 
 def columns(seconds, seed=0):
@@ -116,7 +116,7 @@ def test_the_model_file_is_asked_for_the_measurement_chain_alone(bag, identified
     numbers, effects = {n: 1.3 * x for n, x in BENCH.model.items()}, {"coulomb_friction": {"accel": 0.8}}
     other = Model("other", numbers, BENCH.sensing, effects)
     parameters.save(other, tmp_path / "other.yaml", "numbers and an effect that are not the rig's")
-    result = run(bag, "--method", "weak", "--model", tmp_path / "other.yaml", "--out", tmp_path / "out")
+    result = here(bag, "--method", "weak", "--model", tmp_path / "other.yaml", "--out", tmp_path / "out")
     assert result.returncode == 0, result.stderr
     by_bench, by_other = (json.loads((o / "identified.json").read_text()) for o in (identified[1], tmp_path / "out"))
     assert by_bench["equations"] == by_other["equations"]

@@ -21,7 +21,7 @@ EFFECTS = {"coulomb_friction": {"accel": 0.8}}
 PAYLOAD = Variant("payload", {"mgd_over_J": 1.3, "L_over_J": 0.8, "c_over_J": 0.8})
 PROPELLER = {"k_thrust": 0.8, "k_load": 0.75}
 COMMAND = Command("aeropend_ident.commands.diagnose")
-run, refused = COMMAND.run, COMMAND.refused
+here, refused = COMMAND.here, COMMAND.refused
 
 
 def columns(seed, factor, duration=30.0):
@@ -89,7 +89,7 @@ def test_a_file_of_variants_is_read_with_the_recordings(tmp_path, bags):
     numbers = {n: x * BENCH.model[n] for n, x in PAYLOAD.factor.items()}
     file = tmp_path / "variants.yaml"
     file.write_text(yaml.safe_dump({"payload": {"recordings": ["loaded", str(paths[2])], "numbers": numbers}}))
-    result = run(*paths[:2], "--test", paths[2], "--variants", file, "--out", tmp_path / "out")
+    result = here(*paths[:2], "--test", paths[2], "--variants", file, "--out", tmp_path / "out")
     assert result.returncode == 0, result.stderr
     body = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert [Path(bag).name for bag in body["bags"]] == ["empty", "loaded"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands as a person runs them: a process, its exit code and what it says."""
+"""Commands as a person runs them: exit code and what they say, in a process of their own or in this one."""
 
 import io
 import subprocess
@@ -22,14 +22,19 @@ class Command:
         """Run it to its end."""
         return subprocess.run(self.line(*arguments), capture_output=True, text=True, check=False, timeout=280)
 
-    def refused(self, *arguments: object) -> str:
-        """Run it in this process, which is quicker, on what it cannot use, and return the one line that it says."""
+    def here(self, *arguments: object) -> subprocess.CompletedProcess[str]:
+        """Run it in this process: a new one takes 2 s until it begins."""
         said, error = io.StringIO(), io.StringIO()
         with redirect_stdout(said), redirect_stderr(error):
             try:
                 code = import_module(self._module).main([str(word) for word in arguments])
             except SystemExit as end:
                 code = end.code
-        assert (code, said.getvalue()) == (2, "")
-        assert len(error.getvalue().strip().splitlines()) == 1, error.getvalue()
-        return error.getvalue()
+        return subprocess.CompletedProcess(arguments, code, said.getvalue(), error.getvalue())
+
+    def refused(self, *arguments: object) -> str:
+        """Run it in this process on what it cannot use, and return the one line that it says."""
+        done = self.here(*arguments)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+        return done.stderr
