@@ -4,6 +4,7 @@
 import json
 import re
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,6 @@ from aeropend_ident.diagnosis import diagnosis
 from aeropend_ident.diagnosis.diagnosis import Settings, diagnose
 from aeropend_ident.diagnosis.free_run_gap import Gap
 from aeropend_ident.diagnosis.gap_share import Part
-from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.diagnosis.results import document, verdict_lines
 from aeropend_ident.diagnosis.validation import validate
 from aeropend_ident.signals.signals import from_arrays
@@ -72,30 +72,35 @@ def test_friction_and_a_curve_of_thrust_are_found_to_a_part_in_a_thousand():
     assert candidate(body, "thrust_exponent")["parameters"]["n"]["value"] == pytest.approx(2.15, abs=2e-3)
 
 
+@cache
+def beside_each_other(friction, drop):
+    """A recording of a rig with friction and a voltage drop at the brushes, and its diagnosis."""
+    signals = recorded(71, {"coulomb_friction": {"accel": friction}, "brush_drop": {"v_brush": drop}})
+    return signals, diagnose(BENCH, [signals], 2)
+
+
 @pytest.mark.promise("Verdict", "Several effects are found; the one with the largest share of the gap comes first")
 @pytest.mark.parametrize(("friction", "drop", "first"), [(4.0, 0.05, "coulomb_friction"), (0.2, 0.8, "brush_drop")])
 def test_the_effect_that_opens_more_of_the_gap_comes_first(friction, drop, first):
-    effects = {"coulomb_friction": {"accel": friction}, "brush_drop": {"v_brush": drop}}
-    body = diagnose(BENCH, [recorded(71, effects)], 2).body
+    effects, body = ("coulomb_friction", "brush_drop"), beside_each_other(friction, drop)[1].body
     assert {*body["which"]["effects"], *body["which"].get("small", [])} == set(effects)
     assert body["which"]["verdict"] == body["which"]["effects"][0] == first
     shares = [candidate(body, effect)["share"]["value"] for effect in effects]
-    assert shares[list(effects).index(first)] == max(shares)
+    assert shares[effects.index(first)] == max(shares)
     assert sum(shares) == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.promise("Verdict", "An effect is claimed if its share of the gap is material; smaller ones are listed")
 def test_an_effect_that_makes_little_of_the_gap_is_small_unless_a_person_asks_for_it():
-    signals = recorded(71, {"coulomb_friction": {"accel": 0.2}, "brush_drop": {"v_brush": 0.8}})
-    usual, strict = (diagnose(BENCH, [signals], 2, material=m).conclusions.which for m in (MATERIAL_SHARE, 0.0))
+    signals, found = beside_each_other(0.2, 0.8)
+    usual, strict = found.conclusions.which, diagnose(BENCH, [signals], 2, material=0.0).conclusions.which
     assert (usual.effects, usual.small) == (("brush_drop",), ("coulomb_friction",))
     assert (strict.effects, strict.small) == (("brush_drop", "coulomb_friction"), ())
     assert [c.effect for c in usual.candidates if c.found] == ["brush_drop"]
 
 
 def test_the_verdict_in_a_terminal_tells_the_shares_in_plain_characters():
-    signals = recorded(71, {"coulomb_friction": {"accel": 0.2}, "brush_drop": {"v_brush": 0.8}})
-    lines = verdict_lines(document(diagnose(BENCH, [signals], 2), ["bag"], "bench", 0.0))
+    lines = verdict_lines(document(beside_each_other(0.2, 0.8)[1], ["bag"], "bench", 0.0))
     (claimed,) = (line for line in lines if line.startswith("  brush_drop: "))
     (small,) = (line for line in lines if line.startswith("  not claimed: coulomb_friction, "))
     assert all(re.search(r"\d+ % \(-?\d+ to \d+ %\) of the squared gap$", line) for line in (claimed, small))
@@ -288,12 +293,17 @@ def test_several_recordings_of_one_rig_are_fitted_together():
     assert width[0]["high"] - width[0]["low"] < width[1]["high"] - width[1]["low"]
 
 
+@cache
+def with_friction():
+    """The diagnosis of a rig with dry friction."""
+    return diagnose(BENCH, [recorded(97, {"coulomb_friction": {}})], 2)
+
+
 @pytest.mark.parametrize("missing", [1000, 5000])
 def test_a_test_recording_whose_angle_comes_late_is_judged_from_there_on(missing):
-    model = drawn_rig(97, {"coulomb_friction": {}})
-    found = diagnose(BENCH, [recorded(97, {"coulomb_friction": {}})], 2)
+    found = with_friction()
     duty = steps(40.0, 99)
-    columns, _ = rig.record(model, duty, 99)
+    columns, _ = rig.record(drawn_rig(97, {"coulomb_friction": {}}), duty, 99)
     columns["theta"] = columns["theta"].copy()
     columns["theta"][:missing] = np.nan
     signals = from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)

@@ -2,6 +2,7 @@
 """The nominal model of a driven rig with angle and command alone, in the rig's own units."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -48,12 +49,19 @@ def test_a_model_comes_back_from_other_units_as_it_was():
         "coulomb_friction": pytest.approx({"accel": 0.8}), "command_delay": pytest.approx({"delay": 0.03})}
 
 
+@cache
+def with_friction() -> tuple[Signals, Model]:
+    """Angle and command of a rig with dry friction, and the model that is fitted to them."""
+    s = driven(effects={"coulomb_friction": {"accel": 0.8}})
+    return s, fit_driven_rig(BENCH, [s]).model
+
+
 @pytest.mark.promise("Uncalibrated rigs", "The scale of the duty column and that of time do not change what is found")
 @pytest.mark.parametrize(("time", "duty"), [(4.0, 0.1), (0.25, 1.8)])
 def test_the_scale_of_duty_and_time_changes_the_units_alone(time, duty):
-    s = driven(effects={"coulomb_friction": {"accel": 0.8}})
+    s, one = with_friction()
     other = replace(s, period=time * s.period, duty=duty * s.duty)
-    one, two = (fit_driven_rig(BENCH, [x]).model for x in (s, other))
+    two = fit_driven_rig(BENCH, [other]).model
     assert two.model["mgd_over_J"] * time**2 == pytest.approx(one.model["mgd_over_J"], rel=0.03)
     assert two.model["c_over_J"] * time == pytest.approx(one.model["c_over_J"], rel=0.06)
     assert two.effect("coulomb_friction", "accel") * time**2 == pytest.approx(0.8, rel=0.05)
