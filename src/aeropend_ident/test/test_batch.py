@@ -60,7 +60,7 @@ def recordings(bags, tmp_path_factory):
 def alone(recordings, tmp_path_factory):
     """What one process makes of them: the folder, and what it said."""
     out = tmp_path_factory.mktemp("alone") / "out"
-    result = run("--each", *recordings, "--out", out, "--jobs", 1)
+    result = COMMAND.here("--each", *recordings, "--out", out, "--jobs", 1)
     assert result.returncode == 0, result.stderr
     return out, result
 
@@ -144,7 +144,7 @@ def test_the_command_in_the_report_gives_the_same_verdict(alone, recordings, tmp
     words = head.removeprefix("# ").split()
     assert words[0] == "diagnose"
     words[words.index("--out") + 1] = tmp_path / "out"
-    result = run(*words[1:])
+    result = COMMAND.here(*words[1:])
     assert result.returncode == 0, result.stderr
     body = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     body.pop("seconds")

@@ -205,7 +205,7 @@ def test_a_gust_that_was_not_there_has_appeared(monday):
 @pytest.mark.promise("Verdict", "Zero and sign that were found from the motion serve the next recording too")
 def test_the_next_recording_of_a_rig_that_is_read_upside_down(tmp_path, capsys):
     for day, seed in (("monday", 3), ("tuesday", 503)):
-        columns = columns_of(RIG, seed)
+        columns = columns_of(RIG, seed, 20.0)
         missing = np.full(len(columns["duty"]), np.nan)
         bags.write(tmp_path / day, {"theta": -1.4 - columns["theta"], "duty": columns["duty"], "omega": missing,
                                     "i_a": missing, "v_a": missing}, round(SAMPLE_PERIOD * 1e9))

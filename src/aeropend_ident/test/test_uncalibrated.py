@@ -285,7 +285,7 @@ def test_thrifty_chains_give_what_others_give_and_count():
 
 @pytest.mark.promise("Uncalibrated rigs", "A search that was cut short says so")
 def test_a_search_that_is_cut_short_says_so(monkeypatch):
-    _, read = unknown(3, {"coulomb_friction": {"accel": 0.8}}, duration=20.0)
+    _, read = unknown(3, {"coulomb_friction": {"accel": 0.8}}, duration=8.0)
     signals = from_uncalibrated(read, BENCH.sensing)
     monkeypatch.setattr(policy, "UNCALIBRATED", replace(policy.UNCALIBRATED, budget=1))
     result = diagnose(BENCH, [signals], 2, fit_nominal=True)
