@@ -55,7 +55,7 @@ TRIFLE = 0.1
 Effects that overlap are worth more in the free run than in their stage: a whole share would be too much."""
 
 MOST_EFFECTS = 3
-"""Effects that are searched in one stage (choice).
+"""Effects that are searched one after another in one stage, where sets are not compared (choice).
 
 Measured: at ±30 % no verdict of 25 recordings changes (docs/results/thresholds.md)."""
 
@@ -158,7 +158,8 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
                          deadline=deadline)
                   for b in others}
     known, supported, gained = nominal, findings, 0.0
-    while len(findings.found) < MOST_EFFECTS:
+    in_sets = chains.policy.calibrated and chains.known is None
+    while len(findings.found) < (1 if in_sets else MOST_EFFECTS):
         here = SelectionRound(chains, stage, acts_on, downstream, known, findings.final, trifle, pool, deadline)
         if chains.policy.driven and _explained(here):
             break
@@ -174,10 +175,10 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
     if len(findings.found) > len(supported.found):
         rivals = findings.found[len(supported.found)]
         findings = replace(supported, rivals=rivals, cut_short=findings.cut_short)
-    # one effect that explains all stands in for no others
-    several = chains.policy.calibrated and (len(findings.found) > 1 or not passes_as_noise(findings.final, MATERIAL))
+    # an effect that explains all stands in for no others
+    several = in_sets and not passes_as_noise(findings.final, MATERIAL)
     if not passed(deadline):
-        if several and chains.known is None:
+        if several:
             findings = _with_best_set(chains, findings, nominal, candidates)
         else:
             findings = _with_best_forms(chains, _with_better_rivals(chains, findings, nominal), nominal)
@@ -190,8 +191,8 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
 def _with_best_set(chains: CutChains, findings: Findings, nominal: list[Parameter],
                    candidates: Sequence[Hypothesis]) -> Findings:
     """The best set of effects, each in its best form beside the others; another form may lead to another set."""
-    for _ in range(FORMED_ANEW):
-        best = with_best_set(chains, findings, nominal, candidates)
+    for done in range(FORMED_ANEW):
+        best = with_best_set(chains, findings, nominal, candidates, contenders=not done)
         if best is findings:
             break
         findings = _with_best_forms(chains, best, nominal)

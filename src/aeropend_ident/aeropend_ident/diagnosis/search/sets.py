@@ -21,7 +21,7 @@ from aeropend_ident.diagnosis.chain.values import neutral
 from aeropend_ident.diagnosis.policy import CALIBRATED
 from aeropend_ident.diagnosis.search.findings import Findings, LikelySet, RankedHypothesis, Selection, adopted
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, from_linear, linear_parameters
-from aeropend_ident.diagnosis.search.selection import CONTENDERS
+from aeropend_ident.diagnosis.search.selection import CONTENDERS, ROUNDS
 from aeropend_ident.estimation.linear_sets import LinearSets
 from aeropend_ident.estimation.map_fit import Fit, finite, fit, largest_ess, prior_information, sensitivities
 from aeropend_ident.estimation.parameter import Parameter, started
@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 LARGEST_SET = 5
 """Effects of a stage at most (choice: two more than are searched one after another)."""
 
-TRIES = 3
+TRIES = 2
 """Sets in a row that are fitted and are not better, after which the search ends (choice: the linear model errs)."""
 
 LEAST = 1.0
@@ -42,6 +42,9 @@ PROMISING = 3.0
 """[nats] Log evidence by which a set may be predicted to be worse and still be fitted.
 
 Choice: a linear model errs by as much."""
+
+FIRST_ROUNDS = 2
+"""Rounds of the first fit of a set; one that promises is fitted to its end (choice: it starts close to its end)."""
 
 SMALL = 0.01
 """Step, in standard deviations of the prior, of the derivatives of an effect that is linear in two parameters (choice).
@@ -269,7 +272,7 @@ def names(members: Set) -> frozenset[str]:
 
 
 def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Parameter],
-                  candidates: Sequence[Hypothesis]) -> Findings:
+                  candidates: Sequence[Hypothesis], *, contenders: bool = True) -> Findings:
     """The findings of a stage with the set of effects that has most log evidence.
 
     The search starts from what was found, and from each contender of the first round alone: a lag of the thrust and one
@@ -277,9 +280,10 @@ def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Param
 
     Args:
         chains: the cut chains.
-        findings: what was found one after another.
+        findings: what was found so far.
         nominal: parameters of the stage without effects.
         candidates: effects that may be members of a set.
+        contenders: whether to start from each contender of the first round too.
     """
     found = {h.name for h in findings.effects}
     alone = [r for r in findings.selections[0][:CONTENDERS] if {r.hypothesis.name} != found
@@ -287,7 +291,8 @@ def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Param
              and r.fit.values.keys() == {p.name for p in adopted(list(nominal), r.hypothesis)}]
     seen: set[frozenset[str]] = set()
     best = findings
-    for start in (findings, *(replace(findings, found=((r,),), final=r.fit) for r in alone)):
+    starts = [replace(findings, found=((r,),), final=r.fit) for r in alone] if contenders else []
+    for start in (findings, *starts):
         there = _climbed(chains, start, nominal, candidates, seen)
         if _gain(best, there.effects, there.final) > LEAST:
             best = there
@@ -310,8 +315,11 @@ def _climbed(chains: CutChains, findings: Findings, nominal: Sequence[Parameter]
             break
         members, there = best
         seen.add(names(members))
-        f = _fitted(chains, findings, nominal, members, there.values)
-        if _gain(findings, [m.hypothesis for m in members], f) <= LEAST:
+        effects = [m.hypothesis for m in members]
+        f = _fitted(chains, findings, nominal, members, there.values, FIRST_ROUNDS)
+        if _gain(findings, effects, f) > -PROMISING:
+            f = _fitted(chains, findings, nominal, members, f.values)
+        if _gain(findings, effects, f) <= LEAST:
             failed += 1
             continue
         findings = replace(findings, final=f, found=tuple(_before(findings, m.hypothesis, f) for m in members))
@@ -320,11 +328,11 @@ def _climbed(chains: CutChains, findings: Findings, nominal: Sequence[Parameter]
 
 
 def _fitted(chains: CutChains, findings: Findings, nominal: Sequence[Parameter], members: Set,
-            values: Mapping[str, float]) -> Fit:
+            values: Mapping[str, float], rounds: int = ROUNDS) -> Fit:
     known = list(nominal)
     for m in members:
         known = adopted(known, m.hypothesis)
-    return fit(chains.residuals(findings.stage), started(known, {**findings.final.values, **values}))
+    return fit(chains.residuals(findings.stage), started(known, {**findings.final.values, **values}), rounds)
 
 
 def _gain(findings: Findings, effects: Sequence[Hypothesis], f: Fit) -> float:
@@ -370,7 +378,8 @@ def _with_rivals(chains: CutChains, begun: Findings, findings: Findings, nominal
     for family, (e, m, there) in rivals.items():
         p = weight[family] / total
         if p > CALIBRATED.undecided:
-            f = _fitted(chains, findings, nominal, tuple(m if x is mine else x for x in linear.found), there.values)
+            f = _fitted(chains, findings, nominal, tuple(m if x is mine else x for x in linear.found), there.values,
+                        FIRST_ROUNDS)
             found.append(RankedHypothesis(m.hypothesis, f, e - none, p))
         elif family in ranked:
             found.append(replace(ranked[family], probability=p))
