@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import time
@@ -79,9 +80,12 @@ def value_of(words: Sequence[str]) -> float:
     if len(words) != 1:
         raise UserError(f"give one number, not {' '.join(words) or 'none'}: reference 0.4 (see --help)")
     try:
-        return float(words[0])
+        value = float(words[0])
     except ValueError:
-        raise UserError(f"'{words[0]}' is not a number: reference 0.4 (see --help)") from None
+        value = math.nan
+    if not math.isfinite(value):
+        raise UserError(f"'{words[0]}' is not a number: reference 0.4 (see --help)")
+    return value
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -72,7 +72,9 @@ class Setting:
         if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
             raise UserError(f"parameter {name} is {value!r}: give a {'whole ' if whole else ''}number")
         if not self.low <= value <= self.high or not math.isfinite(value):
-            raise UserError(f"parameter {name} is {value:g}: give {self.low:g} to {self.high:g} {self.unit}".rstrip())
+            form = "d" if whole else "g"
+            raise UserError(f"parameter {name} is {value:{form}}: give {self.low:.12g} to {self.high:.12g} {self.unit}"
+                            .rstrip())
         return kind(value)
 
     def descriptor(self) -> ParameterDescriptor:
