@@ -101,3 +101,16 @@ def test_a_winding_that_cannot_be_fitted_is_refused_in_one_line(change, says):
     read.i_a = change(read.i_a)
     with pytest.raises(BenchTestError, match=says):
         estimates.blocked_recording(read, "bag")
+
+
+def test_rows_of_one_speed_show_no_viscous_load_and_warn_of_nothing():
+    rows = estimates.Rows("same", {"v_a": np.full(12, 3.0), "i_a": np.full(12, 0.3), "omega": np.full(12, 50.0)})
+    with np.errstate(all="raise"):
+        found = estimates.steady(rows, Estimate(1.08, 0.0, "Ω", "Table 4.1"))
+    assert found.numbers["B_m"].how == "not seen"
+
+
+def test_too_few_rows_say_how_a_recording_gets_more():
+    rows = estimates.Rows("few", {"v_a": np.ones(2), "i_a": np.ones(2), "omega": np.ones(2)})
+    with pytest.raises(estimates.BenchTestError, match=r"2 rows hold .*each held for some seconds \(excite"):
+        rows.take("v_a", "i_a", "omega")

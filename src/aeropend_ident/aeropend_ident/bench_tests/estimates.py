@@ -90,7 +90,9 @@ class Rows:
                                 + [self.sigma.get(name, np.zeros(len(self))) for name in names])
         table = table[np.isfinite(table).all(axis=1)]
         if len(table) < least:
-            raise BenchTestError(f"{self.name}: {len(table)} rows hold {' and '.join(names)}; give at least {least}")
+            raise BenchTestError(f"{self.name}: {len(table)} rows hold {' and '.join(names)}; give at least {least}, "
+                                 "or of a recording that many duties, each held for some seconds (excite --ros-args "
+                                 "-p kind:=staircase)")
         return list(table.T)
 
 
@@ -323,7 +325,7 @@ def steady(rows: Rows, resistance: Estimate) -> Found:
                    constant.value * np.hypot(di, 2.0 * i / w * dw) / w**2)
     numbers = {"K_e": constant, "K_t": constant}
     viscous = Estimate(0.0, 0.0, "N·m·s/rad", "not seen")
-    if len(w) > 3:
+    if np.unique(w).size > 3:
         # without their own uncertainty, rows have equal relative weight
         weight = 1.0 / (constant.value * np.hypot(di, 2.0 * i / w * dw) if (di > 0.0).all() else torque)
         (b, k), covariance = _lines(weight[:, None] * np.column_stack([w, w * w]), weight * torque)
