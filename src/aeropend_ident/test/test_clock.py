@@ -160,6 +160,7 @@ def test_rows_without_a_time_are_told():
     "Tables", "Time stamps that are late, rounded, repeated or out of order are repaired, and the repairs are listed")
 @pytest.mark.parametrize(("stamps", "options", "says"), [
     (lambda t: np.where(t > 5.0, t - 5.0, t), {}, "time goes back from 5 s to 0.02 s (a restart"),
+    (lambda t: np.where(t > 5.0, t - 86400.0, t), {}, "leave out --time and give --rate HZ"),
     (lambda t: t * 0.0, {}, "the same time"),
     (lambda t: t * np.nan, {}, "too few"),
     (np.floor, {"clock": "stamps"}, "leave --clock stamps away"),

@@ -140,6 +140,7 @@ UNREADABLE = {
     "hello\nworld\n" * 20: "no table of numbers",
     "\n\n": "the file is empty",
     "": "the file is empty",
+    "%PDF-1.4 hello\n": "holds nothing but comments",
     b"\x00\x01\x02" * 100: "bytes that no text has",
     "t,x\n" + NUMBERS + "1" * 70000 + "\n": "line 202 is longer",
 }

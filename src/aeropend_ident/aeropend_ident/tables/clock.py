@@ -166,7 +166,8 @@ def date(time: Floats, angle: Floats, lines: Ints, *, is_clock: bool = False, ti
     if len(back):
         k = int(back[0])
         raise ClockError(f"line {lines[rows[k + 1]]}: time goes back from {t[k]:.10g} s to {t[k + 1]:.10g} s (a "
-                         "restart, or a clock that was set): split the file there")
+                         "restart, or a clock that was set): split the file there; of evenly spaced rows, leave out "
+                         "--time and give --rate HZ")
     if np.ptp(t) == 0.0:
         raise ClockError("all rows have the same time: name another column, or give --rate")
     sent = None if lengths is None else lengths[rows]
@@ -255,8 +256,10 @@ def _sorted(t: Floats, rows: Ints, notes: list[str]) -> tuple[Floats, Ints]:
         return t, rows
     order = np.argsort(t, kind="stable")
     back = np.diff(t) < 0.0
-    if not (back.all() or back.mean() <= REPEATED) or _grid(t[order]) is None:
+    if not (back.all() or back.mean() <= REPEATED) or (grid := _grid(t[order])) is None:
         return t, rows
+    if not back.all() and np.max(grid.steps, initial=0.0) > max(BACK, -0.5 * float(np.diff(t).min())):
+        return t, rows  # the clock was set: what came first would be put behind what came later
     notes.append(f"{counted(int((np.diff(t) < 0.0).sum()), 'row')} out of order: rows sorted by their time")
     return t[order], rows[order]
 

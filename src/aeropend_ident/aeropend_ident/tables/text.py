@@ -208,6 +208,8 @@ def _dialect(path: Path, sample: Sequence[str], delimiter: str | None, decimal: 
     """Find delimiter, decimal marks and width: those with which most cells of the sample can be read."""
     lines = [line for line in sample if line.strip() and not _is_comment(line)]
     if not lines:
+        if any(line.strip() for line in sample):
+            raise TableError(f"{path}: holds nothing but comments: export the data as columns of numbers")
         raise TableError(f"{path}: the file is empty")
     lower = lines[len(lines) // 4 :]  # a head has no numbers
     best: tuple[tuple[float, float, int], Dialect] | None = None
