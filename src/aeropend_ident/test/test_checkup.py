@@ -60,7 +60,7 @@ def test_a_good_recording_is_ok(path):
     (lambda r: {"duty": np.full(len(r), 0.3)}, "warning", "the duty stays at 0.3"),
     (lambda r: {"duty": np.full(len(r), np.nan), "v_a": np.full(len(r), np.nan)}, "warning", "only a free decay"),
     (lambda r: {"t": 0.5 * r.t}, "warning", "only 16 s long"),
-    (lambda r: {"gaps": np.array([[100, 2000]])}, "warning", "11.3 % of the samples are lost"),
+    (lambda r: {"gaps": np.array([[k, 10] for k in range(200)])}, "warning", "11.3 % of the samples are lost"),
 ])
 def test_each_fault_of_a_recording_is_found(good, change, level, words):
     assert bad(of_bag.contents("bag", good)) == []

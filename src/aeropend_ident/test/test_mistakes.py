@@ -48,6 +48,7 @@ SURE = {
     "degrees and rpm": lambda c: {"theta": np.degrees(c["theta"]), "omega": c["omega"] * 60.0 / (2.0 * np.pi)},
     "hangs at 90, in degrees": lambda c: {"theta": np.degrees(c["theta"]) + 90.0},
     "hangs at 0.4, turned over": lambda c: {"theta": 0.4 - c["theta"]},
+    "-1 without drive": lambda c: {"duty": 2.0 * c["duty"] - 1.0},
 }
 LIKELY = {
     "hangs at 0.4 rad": lambda c: {"theta": c["theta"] + 0.4},
@@ -91,6 +92,13 @@ def test_a_sure_mistake_is_refused_with_the_command_that_mends_it(columns, tmp_p
     else:
         alike(new, columns)
     assert as_signals(new, BENCH).notes == ()
+
+
+def test_an_angle_in_counts_is_refused_with_the_command_that_mends_it(columns, tmp_path):
+    write(tmp_path / "bag", columns | {"theta": np.rint(columns["theta"] * 1024 / (2.0 * np.pi)) + 257.0}, PERIOD_NS)
+    with pytest.raises(RecordingError, match=r"the angle is in counts:1024 .* --zero 2\d\d`") as refused:
+        as_signals(read(tmp_path / "bag"), BENCH)
+    np.testing.assert_allclose(mended(str(refused.value), tmp_path / "bag").theta, columns["theta"], atol=0.06)
 
 
 @pytest.mark.parametrize("what", LIKELY)

@@ -227,7 +227,8 @@ def test_armature_on_other_stamps_is_left_out(bags, tmp_path):
     recording = read(bags.write(tmp_path / "bag", bags.Content(made.without("/armature").messages + moved)))
     assert len(recording) == 20
     assert np.isnan(recording.v_a).all()
-    assert "no stamp of armature equals one of joint_states: armature is left out" in recording.notes
+    assert ("no stamp of armature equals one of joint_states: armature is left out; give both messages of a sample the "
+            "same stamp, and record again") in recording.notes
 
 
 def test_messages_that_are_none_are_counted(bags, tmp_path):
@@ -258,4 +259,4 @@ def test_two_rigs_on_one_topic_are_noticed(bags, tmp_path):
                for topic, kind, received, _ in other.messages if topic == "/joint_states"]
     both = bags.Content(sorted(one.messages + shifted, key=lambda m: m[2]), {})
     notes = read(bags.write(tmp_path / "bag", both)).notes
-    assert any("two rigs on one topic" in note for note in notes), notes
+    assert any("two programs publish one topic" in note for note in notes), notes

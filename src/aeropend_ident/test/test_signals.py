@@ -348,7 +348,7 @@ def test_pieces_between_pauses_may_be_too_short_for_a_verdict(tmp_path):
     made = {name: x[:60] for name, x in columns().items()}
     steps_ns = np.where(np.arange(60) % 3 == 0, 11_000_000_000, 2_040_000)
     read_ = recording(np.cumsum(steps_ns) * 1e-9, **made)
-    with pytest.raises(RecordingError, match="3 samples without a pause are too few for a verdict"):
+    with pytest.raises(RecordingError, match="3 samples without a pause are too few for a verdict: record 5 s"):
         as_signals(read_, BENCH, fit_nominal=True)
 
 

@@ -7,6 +7,7 @@ lists what is wrong with it in `problems`. It never writes to a bag.
 
 from __future__ import annotations
 
+import shlex
 import tempfile
 from collections import Counter
 from contextlib import ExitStack
@@ -25,7 +26,8 @@ from aeropend_ident.bags.reading import (
     unpacked,
 )
 from aeropend_ident.bags.sqlite import read_sqlite
-from aeropend_sim.untrusted import load_yaml, one_line
+from aeropend_sim.cli.command import called
+from aeropend_sim.untrusted import load_yaml, one_line, printable
 
 NEWEST_VERSION = 9
 """Newest version of the metadata of rosbag2 that is known here."""
@@ -66,7 +68,9 @@ class Bag:
         kinds = {_storage_suffix(file) for file in self._files}
         if len(kinds) != 1 or None in kinds:
             names = ", ".join(file.name for file in self._files)
-            raise RecordingError(f"{path}: not a bag: {names} (expected .mcap or .db3 files)")
+            table = printable(f"{called('import', 'aeropend_ident')} {shlex.quote(str(path))}")
+            raise RecordingError(f"{path}: not a bag: {names} (expected .mcap or .db3 files); if it is a table, "
+                                 f"`{table}` shows how to make a recording of it")
         self.storage = STORAGES[kinds.pop() or ""]
 
     def messages(self, chosen: Chosen | None = None) -> Messages:

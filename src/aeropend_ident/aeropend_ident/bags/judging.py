@@ -59,6 +59,11 @@ def numbers(raw: NDArray[np.floating[Any]]) -> Floats:
         return np.where(np.isnan(raw), np.nan, raw.astype(np.float64))
 
 
+def of(name: str) -> str:
+    """The words by which a note names the readings of a channel that are left out."""
+    return f" of {name} "
+
+
 def channel(name: str, values: Floats, notes: list[str], others: Mapping[str, Floats] | None = None) -> Floats:
     """The readings of a channel (N,); NaN where a number can be none, with a note of their number.
 
@@ -84,7 +89,7 @@ def channel(name: str, values: Floats, notes: list[str], others: Mapping[str, Fl
         raise RecordingError(f"the duty goes from {low:.3g} to {high:.3g}, but is a fraction, -1 to 1: "
                              f"{'; '.join(_other_duties(low, high, others or {}))}")
     first = float(values[np.argmax(wrong)])
-    notes.append(f"{counted(number, 'reading')} of {name} {'is' if number == 1 else 'are'} no possible number (first "
+    notes.append(f"{counted(number, 'reading')}{of(name)}{'is' if number == 1 else 'are'} no possible number (first "
                  f"{first:g}, possible are {-MOST[name]:g} to {MOST[name]:g}): left out")
     return np.where(wrong, np.nan, values)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -26,7 +26,7 @@ from aeropend_ident.bags.reading import RecordingError
 from aeropend_sim.untrusted import printable
 from aeropend_sim.wording import counted
 
-__all__ = ["CHANNELS", "Recording", "RecordingError", "Truth", "holds", "read", "split_topic"]
+__all__ = ["CHANNELS", "Recording", "RecordingError", "Truth", "holds", "read", "shown", "split_topic"]
 
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -38,6 +38,9 @@ OFF_GRID = 0.25
 
 MOST_NAMES = 8
 """Joints of another robot that are named (choice)."""
+
+OFF = "the stamps do not lie on one grid"
+"""What a note says of stamps at irregular times."""
 
 IRREGULAR = 0.01
 """Share of steps off the grid from which on it is said."""
@@ -56,7 +59,13 @@ _JOINTS = ("theta", "theta_dot", "omega")
 NO_JOINT = f"has no joint named {_ARM} or {_ROTOR}"
 """What a note says of joints that are none of ours."""
 NO_JOINTS = "there is no joint_states"
-"""What a note says where joints have a topic of another name."""
+"""What a note says where joints have a topic of another name or type, or none."""
+NO_POSITION = f"the position of '{_ARM}' is no number in any message"
+"""What a note says where the position of another joint holds numbers."""
+NO_DUTY = "holds no duty"
+"""What a note says of commands that are none."""
+STANDS = 20
+"""Messages of one stamp from which on its clock stands still (choice: no program repeats a sample as often)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,10 +183,13 @@ def read(path: Path | str, namespace: str | None = None, *, judged: bool = True)
     rigs, strange = _rigs(series, bag, others=not judged)
     found = _choose(rigs, namespace, bag)
     notes = [strange[found]] if found in strange else []
+    notes += _of_other_types(rigs[found], found, bag)
     odd = [topic for topic, msgtype in bag.counts if msgtype == _JOINT and split_topic(topic, msgtype) is None]
     if odd and found not in strange and "joint_states" not in rigs[found]:
         notes.append(f"{NO_JOINTS}; {printable(odd[0])} has another name: record it as joint_states (--ros-args -r "
                      f"{printable(odd[0])}:=joint_states of the program that publishes it)")
+    elif "joint_states" not in rigs[found] and not any(NO_JOINT in note or NO_JOINTS in note for note in notes):
+        notes.append(f"{NO_JOINTS}: record it together with armature")
     try:
         recording = _Join(rigs[found], notes, judged=judged).recording(str(path), found, complete=not bag.problems)
     except RecordingError as error:
@@ -236,9 +248,10 @@ def _rigs(series: dict[tuple[str, str], _Series], bag: Bag, *, others: bool
     for place, topics in list(rigs.items()):
         joints = topics.get("joint_states")
         if joints is not None and (names := _other_joints(joints)) is not None:
-            its = f" (its joints: {', '.join(names)})" if any(names) else ""
-            strange[place] = f"{joints.topic} {NO_JOINT}{its}"
-            takes[place] = _taking(joints)
+            its = f"its joints: {', '.join(map(shown, names))}" if any(names) else "its messages name no joint"
+            strange[place] = f"{joints.topic} {NO_JOINT} ({its})"
+            takes[place] = _taking(joints) or (f"; name the joints {_ARM} and {_ROTOR} in the program that publishes "
+                                               "them, and record again")
             if not others:
                 del topics["joint_states"]
         if not {"joint_states", "armature"} & set(topics):
@@ -261,13 +274,26 @@ def _rigs(series: dict[tuple[str, str], _Series], bag: Bag, *, others: bool
                          "record those of the rig too, or name the rig's topics so (--ros-args -r)")
 
 
+def _of_other_types(rig: Mapping[str, _Series], place: str, bag: Bag) -> list[str]:
+    """What is to be said of topics with the name of ours and another type, where ours is not there."""
+    out = []
+    for topic, msgtype in bag.counts:
+        name = topic.rpartition("/")[2]
+        if name in rig or topic not in (f"{place.rstrip('/')}/{name}", name) or msgtype == _TOPICS.get(name, msgtype):
+            continue
+        what = {"joint_states": f"{NO_JOINTS} of the right type: ", "duty_command": f"duty_command {NO_DUTY}: "}
+        out.append(f"{what.get(name, '')}{printable(topic)} has the type {printable(msgtype)} and is left out; publish "
+                   f"it as {_TOPICS[name]}, and record again")
+    return out
+
+
 def _other_joints(joints: _Series) -> list[str] | None:
     """The names of joints of which none is ours; None if one is, or if no message can be decoded."""
     for messages in (joints.messages[:1], joints.messages):  # the first message tells, but for a strange one
         names = {name for block in decode(messages, _JOINT)[0] for name in block.names.get("name", ())}
         if {_ARM, _ROTOR} & names:
             return None
-    return sorted(map(printable, names))[:MOST_NAMES] if decode(joints.messages[:1], _JOINT)[0] else None
+    return sorted(names)[:MOST_NAMES] if decode(joints.messages[:1], _JOINT)[0] else None
 
 
 def _taking(joints: _Series) -> str:
@@ -282,7 +308,12 @@ def _taking(joints: _Series) -> str:
     rotor = next((name for name in turned["velocity"] if name != arm), None)
     options = [f"--theta {shlex.quote(f'{arm}:rad')}"]
     options += [f"--omega {shlex.quote(f'{rotor}.velocity:rad/s')}"] if rotor is not None else []
-    return f"; if {printable(arm)} is the arm, {mend(*options)}"
+    return f"; if {shown(arm)} is the arm, {mend(*options)}"
+
+
+def shown(name: str) -> str:
+    """The name of a joint as a message shows it: in quotation marks if blanks begin or end it."""
+    return printable(name if name == name.strip() else repr(name))
 
 
 def _choose(rigs: dict[str, dict[str, _Series]], namespace: str | None, bag: Bag) -> str:
@@ -318,7 +349,8 @@ class _Join:
         if len(joints.stamps) and len(armature.stamps):
             common = len(np.intersect1d(joints.stamps, armature.stamps, assume_unique=True))
             if not common:
-                notes.append("no stamp of armature equals one of joint_states: armature is left out")
+                notes.append("no stamp of armature equals one of joint_states: armature is left out; give both "
+                             "messages of a sample the same stamp, and record again")
                 armature = empty
             elif alone := len(joints.stamps) - common:
                 notes.append(f"{counted(alone, 'sample')} of joint_states {_has(alone)} no armature of the same stamp")
@@ -331,6 +363,9 @@ class _Join:
         self.received = np.zeros(len(self.stamps), dtype=np.int64)
         for table in (armature, joints):  # where both are there, the arrival of joint_states counts
             self.received[np.searchsorted(self.stamps, table.stamps)] = table.received
+        if len(self.stamps) == 1 and self.duplicates >= STANDS:
+            raise RecordingError(f"{'; '.join(notes)}; no two samples have different stamps: set header.stamp to the "
+                                 "instant of each sample in the program that publishes them, and record again")
         self.columns = self._placed((armature, joints), CHANNELS)
         self.others = self._placed((joints,), [name for name in joints.columns if name not in _JOINTS])
         if judged:
@@ -372,7 +407,8 @@ class _Join:
             are = "is" if missing == 1 else "are"
             self.notes.append(f"{counted(missing, 'sample')} {are} missing in {counted(len(self.gaps), 'gap')}")
         if self.irregular > IRREGULAR * len(self.stamps) or len(self.gaps) > 0.25 * len(self.stamps):
-            self.notes.append("the stamps do not lie on one grid: two rigs on one topic, or most samples were lost")
+            self.notes.append(f"{OFF}: two programs publish one topic (`ros2 topic info -v` lists them: end one, and "
+                              "record again), or most samples were lost")
         return Recording(
             path=path,
             namespace=namespace,
@@ -397,8 +433,14 @@ class _Join:
     def _joints(self, series: _Series) -> _Table:
         columns = {name: np.full(len(series.messages), np.nan) for name in _JOINTS}
         blocks = self._decode(series)
+        nameless, twice, turned = 0, set(), False
         for block in blocks:
             names = block.names.get("name", ())
+            nameless += 0 if {_ARM, _ROTOR} & set(names) else len(block.rows)
+            twice |= {name for name in (_ARM, _ROTOR) if names.count(name) > 1}
+            positions = judging.numbers(block.numbers["position"])
+            if _ROTOR in names and names.index(_ROTOR) < positions.shape[1]:
+                turned |= bool(np.isfinite(positions[:, names.index(_ROTOR)]).any())
             for column, joint, field in (
                 ("theta", _ARM, "position"),
                 ("theta_dot", _ARM, "velocity"),
@@ -414,6 +456,15 @@ class _Join:
                     values = judging.numbers(block.numbers[field_])
                     if k < values.shape[1] and (column in columns or len(columns) < 2 * MOST_NAMES):
                         columns.setdefault(column, np.full(len(series.messages), np.nan))[block.rows] = values[:, k]
+        if 0 < nameless < sum(len(block.rows) for block in blocks):
+            name = "names" if nameless == 1 else "name"
+            self.notes.append(f"{counted(nameless, 'message')} of {series.topic} {name} neither {_ARM} nor {_ROTOR}: "
+                              "left out")
+        self.notes += [f"{series.topic} names the joint {name} twice: the first counts, the second is left out"
+                       for name in sorted(twice)]
+        if turned and not np.isfinite(columns["theta"]).any():
+            self.notes.append(f"{series.topic}: {NO_POSITION}, that of '{_ROTOR}' is: if the names are exchanged, "
+                              "correct the program that publishes them, and record again")
         return self._table(series, blocks, columns)
 
     def _armature(self, series: _Series) -> _Table:
@@ -456,7 +507,10 @@ class _Join:
             raise RecordingError(f"{series.topic}: header.stamp is never set, so its samples cannot be dated or "
                                  "joined: set it to the instant of each sample in the program that publishes them")
         rows = np.flatnonzero(understood)
-        sorted_stamps, first = np.unique(stamps[rows], return_index=True)
+        sorted_stamps, first, times = np.unique(stamps[rows], return_index=True, return_counts=True)
+        if len(times) and times.max() >= STANDS:
+            self.notes.append(f"{int(times.max())} messages of {series.topic} have one stamp: the clock that stamps "
+                              "them stands still; all but the first are left out")
         self.duplicates += len(rows) - len(first)
         rows = rows[first]
         received = np.array(series.times, dtype=np.int64)[rows]
@@ -476,6 +530,9 @@ class _Join:
         times, values = self.command
         taken = np.isfinite(values)
         if not taken.any():
+            if len(values):
+                self.notes.append(f"duty_command {NO_DUTY}: none of its {counted(len(values), 'message')} is a number; "
+                                  "correct the program that publishes them, and record again")
             return
         times, values = times[taken], values[taken]
         if judged:

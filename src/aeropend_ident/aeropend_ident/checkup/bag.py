@@ -48,7 +48,10 @@ Choice: 10 simulated and 13 real rigs have 0.7 to 0.99."""
 SHORT = 30.0
 """[s] Length below which a recording is called short (choice)."""
 
-BAD = ("left out", "mended copy")
+PAUSE = 1.0
+"""[s] Length of a gap from which on it is a pause and no loss (choice)."""
+
+BAD = ("left out", "mended copy", recording.NO_DUTY, recording.NO_JOINTS, recording.NO_POSITION, recording.OFF)
 """What a note says of data that is not used, or that may be wrong."""
 
 
@@ -84,8 +87,10 @@ def checks(path: str, model: Model, namespace: str | None = None) -> Iterator[Ch
         yield warning(path, named(mistakes.said(likely), path))
     yield from contents(path, read, likely)
     if sure := [one for one in likely if one.sure]:
-        until = " until this is mended" if any(one.options for one in sure) else " with this model"
-        yield error(path, f"diagnose refuses it{until}; diagnose --uncalibrated needs no model")
+        if any(one.options for one in sure):
+            yield error(path, "diagnose refuses it until this is mended; diagnose --uncalibrated needs no model")
+        else:
+            yield error(path, f"diagnose refuses it: {mistakes.said(sure)}")
     elif np.isfinite(read.theta).any():
         yield from _use(path, read, model)
 
@@ -108,11 +113,19 @@ def _samples(path: str, read: Recording) -> Iterator[Check]:
     """Length and lost samples."""
     if read.duration < SHORT - 0.5:  # as the number that is printed is rounded
         yield warning(path, f"only {read.duration:.0f} s long: record {SHORT:.0f} s or more")
-    share = read.lost / max(read.lost + len(read), 1)
+    pauses = read.gaps[:, 1] * read.period > PAUSE
+    lost = read.lost - int(read.gaps[pauses, 1].sum())
+    if pauses.any():
+        row, missing = read.gaps[pauses][0]
+        often = "once" if pauses.sum() == 1 else f"{int(pauses.sum())} times"
+        yield warning(path, f"the recording pauses {often}, first at {read.t[row]:.1f} s for "
+                      f"{missing * read.period:.3g} s: if the rig ran on, look for a program or a clock that stood "
+                      "still")
+    share = lost / max(lost + len(read), 1)
     if share > FEW_LOST:
         yield warning(path, f"{100.0 * share:.1f} % of the samples are lost: record with less load, or by cable")
-    elif read.lost:
-        yield ok(path, f"{counted(read.lost, 'sample')} lost")
+    elif lost:
+        yield ok(path, f"{counted(lost, 'sample')} lost")
 
 
 def _duty(path: str, read: Recording) -> Iterator[Check]:
@@ -176,7 +189,7 @@ def _use(path: str, read: Recording, model: Model) -> Iterator[Check]:
     excited.
     """
     try:
-        as_signals(read, model)
+        used = as_signals(read, model)
     except RecordingError as refused:
         reason = str(refused).removeprefix(f"{path}: ")
         try:
@@ -186,6 +199,9 @@ def _use(path: str, read: Recording, model: Model) -> Iterator[Check]:
         else:
             yield error(path, f"{reason}; only diagnose --uncalibrated can use it")
         return
+    for note in used.notes:
+        if note not in read.notes:
+            yield (warning if any(words in note for words in BAD) else ok)(path, note)
     try:
         data = dataset.from_bag(read, model.sensing, inputs=("duty",), held_out=0.0)
         bare = model.with_effects({})

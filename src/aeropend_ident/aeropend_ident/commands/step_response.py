@@ -17,10 +17,13 @@ from rich.console import Console
 from aeropend_control.analysis import step_report
 from aeropend_control.analysis.step_response import StepError, step_responses
 from aeropend_control.laws.registry import LAWS
+from aeropend_ident.bags.mending import named
 from aeropend_ident.bags.recording import Recording, read
 from aeropend_ident.result_folder import OutputError
+from aeropend_ident.signals import mistakes
 from aeropend_sim.cli.command import EXIT_CODES, Parser, entry_point
 from aeropend_sim.untrusted import printable
+from aeropend_sim.wording import counted
 
 SHORTEST_S = 1.0
 """A last step held for less is left out: recordings end at any time."""
@@ -66,7 +69,8 @@ def columns(recording: Recording, law: str) -> tuple[step_report.Array, dict[str
     taken = (recording.reference >= low) & (recording.reference <= high)
     at, levels = recording.reference_ns[taken], recording.reference[taken]
     if not len(at):
-        raise StepError(f"{recording.path} holds no reference for {law} ({low:g} to {high:g} {kind.reference_unit})")
+        raise StepError(f"{recording.path} holds no reference for {law} ({low:g} to {high:g} {kind.reference_unit})"
+                        f"{_why(recording.reference)}")
     number = np.searchsorted(at, recording.received_ns, side="right")
     used = number > 0
     if not used.any() or not np.isfinite(getattr(recording, kind.measures)[used]).any():
@@ -82,6 +86,30 @@ def columns(recording: Recording, law: str) -> tuple[step_report.Array, dict[str
     if last > 0 and time[-1] - time[last] < SHORTEST_S:
         time, grid = time[:last], {name: values[:last] for name, values in grid.items()}
     return time, grid
+
+
+def _why(reference: step_report.Array) -> str:
+    """What is to be done where no reference (L,) counts."""
+    known = reference[np.isfinite(reference)]
+    if not len(reference):
+        return ": record the topic reference while the controller gets its steps (step_test)"
+    if not len(known):
+        return f": all {len(reference)} references are NaN or infinite; correct the program that publishes them"
+    return (f": its references go from {known.min():.4g} to {known.max():.4g}; give the --law that ran, or publish "
+            "them in its unit")
+
+
+def remarks(recording: Recording, law: str) -> list[str]:
+    """What to know of the references and the angle of a recording: what is left out, and what looks mistaken."""
+    kind = LAWS[law]
+    low, high = kind.reference_limits
+    out = []
+    left = recording.reference[~((recording.reference >= low) & (recording.reference <= high))]
+    if len(left):
+        out.append(f"{counted(len(left), 'reference')} beyond {low:g} to {high:g} {kind.reference_unit} left out, as "
+                   f"the controller refuses it (first {left[0]:.4g})")
+    likely = mistakes.without_model(recording.theta, recording.duty, recording.i_a, recording.v_a)
+    return out + [named(mistakes.said([one]), recording.path) for one in likely]
 
 
 def run(options: argparse.Namespace) -> None:
@@ -107,7 +135,7 @@ def run(options: argparse.Namespace) -> None:
         except OSError as error:
             raise OutputError(f"{options.plot} cannot be written: {error.strerror}") from None
     console = Console(width=None if sys.stdout.isatty() else 120)
-    for note in recording.notes:
+    for note in (*recording.notes, *remarks(recording, options.law)):
         print(printable(f"note: {note}"))
     console.print(step_report.table({options.law: described}, {options.law: kind.reference_unit}))
 

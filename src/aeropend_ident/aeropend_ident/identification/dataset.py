@@ -293,7 +293,8 @@ def _check_channel(read: Recording, name: str) -> None:
                              "--input)")
     if holes:
         raise RecordingError(f"{read.path}: {name} is not a number in {holes} of {len(x)} samples; identification "
-                             "needs a recording without holes")
+                             "needs a recording without holes: mend the sensor and record again, or leave it out "
+                             "(identify --states, --input)")
     _check_alive(read.path, {name: x})
 
 

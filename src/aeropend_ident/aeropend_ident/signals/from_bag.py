@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.bags import recording
+from aeropend_ident.bags import judging, recording
 from aeropend_ident.bags.mending import mend, named
 from aeropend_ident.bags.recording import Recording, RecordingError
 from aeropend_ident.signals import mistakes
@@ -124,10 +124,14 @@ def as_signals(read: Recording, model: Model, held_out: float = 0.3, *, fit_nomi
     if not fit_nominal:
         check_period(read)
         piece = longest_piece(with_voltage_as_command(read, model.model["v_full"]) if model.model["v_full"] else read)
+        if not np.isfinite(piece.duty).any() and (why := _noted(read, recording.NO_DUTY)) is not None:
+            raise RecordingError(f"{read.path}: no duty: {why}")
         return from_recording(checked(piece, model, mounting), model.sensing, held_out)
     piece = longest_piece(read)
     if len(piece) < FEWEST:
-        raise RecordingError(f"{read.path}: {len(piece)} samples without a pause are too few for a verdict")
+        raise RecordingError(f"{read.path}: {counted(len(piece), 'sample')} without a pause "
+                             f"{'is' if len(piece) == 1 else 'are'} too few for a verdict: record {MINIMUM_DURATION:g} "
+                             "s or more without a pause")
     piece = with_voltage_as_command(piece)
     likely = mistakes.without_model(piece.theta, piece.duty, piece.i_a, piece.v_a)
     piece = replace(piece, notes=(*piece.notes, *(named(mistakes.said([one]), read.path) for one in likely)))
@@ -154,19 +158,24 @@ def checked(read: Recording, model: Model, mounting: Mounting | None = None) -> 
 def no_angle(read: Recording) -> str:
     """Why a recording has no angle, and what to do if the arm has another name."""
     positions = [name for name in read.others if f"{name}.velocity" in read.others or not name.endswith(".velocity")]
-    if (said := next((note for note in read.notes if recording.NO_JOINT in note or recording.NO_JOINTS in note), None)
-        ) is not None:
-        return f"no arm angle: {said}"
     if not positions:
-        return "no arm angle was measured (joint_states, position of 'arm')"
+        said = _noted(read, recording.NO_JOINT, recording.NO_JOINTS, recording.NO_POSITION, judging.of("theta"))
+        return f"no arm angle: {said}" if said else (
+            "no arm angle was measured (joint_states, position of 'arm'): it is missing or NaN in all messages; check "
+            "the sensor and the program that publishes them, and record again")
     options = [f"--theta {positions[0]}:rad"]
     speeds = [name for name in read.others if name.endswith(".velocity") and name != f"{positions[0]}.velocity"]
     if not np.isfinite(read.omega).any() and speeds:
         options.append(f"--omega {speeds[0]}:rad/s")
-    names = dict.fromkeys(name.removesuffix(".velocity") for name in read.others)
+    names = dict.fromkeys(recording.shown(name.removesuffix(".velocity")) for name in read.others)
     return (f"no arm angle: joint_states has {'the joint' if len(names) == 1 else 'joints named'} {', '.join(names)}, "
-            f"none is called arm: if {positions[0]} is the arm, "
+            f"none is called arm: if {recording.shown(positions[0])} is the arm, "
             f"{named(mend(*(shlex.join(option.split(' ', 1)) for option in options)), read.path)}")
+
+
+def _noted(read: Recording, *words: str) -> str | None:
+    """The first note of a recording with one of these words."""
+    return next((note for note in read.notes if any(word in note for word in words)), None)
 
 
 def check_stamps(read: Recording) -> None:
@@ -205,7 +214,10 @@ def likely_mistakes(read: Recording, model: Model, mounting: Mounting | None = N
     if not np.isfinite(columns["duty"]).any():
         return []
     columns["theta"] = (mounting or Mounting()).upright(columns["theta"])
-    return mistakes.found(columns, hold(columns["duty"]), period, model)
+    likely = mistakes.found(columns, hold(columns["duty"]), period, model)
+    if any(mistakes.JUMPS in one.what for one in likely) and (off := _noted(read, recording.OFF)) is not None:
+        return [Mistake(f"the angle jumps, and {off}", sure=True)]
+    return likely
 
 
 def _driven_backward(read: Recording, *, reverses: bool) -> Recording:

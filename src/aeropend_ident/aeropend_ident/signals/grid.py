@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from aeropend_ident.bags import recording
 from aeropend_ident.bags.recording import OFF_GRID, Recording, RecordingError
+from aeropend_ident.signals.signals import MINIMUM_DURATION
+from aeropend_sim.wording import counted
 
 PAUSE = 10.0
 """[s] Gap between samples after which the state before it no longer matters.
@@ -46,13 +48,14 @@ def check_period(read: Recording) -> None:
         RecordingError: too few samples, or too many steps that fit no period.
     """
     if len(read) < 3:
-        raise RecordingError(f"{read.path}: {len(read)} samples are too few for a verdict")
+        raise RecordingError(f"{read.path}: {counted(len(read), 'sample')} {'is' if len(read) == 1 else 'are'} too few "
+                             f"for a verdict: record {MINIMUM_DURATION:g} s or more")
     steps = np.diff(read.stamp_ns)
     periods = steps / np.median(steps)
     share = float(np.mean(np.abs(periods - np.maximum(np.rint(periods), 1.0)) > OFF_GRID))
     if share > IRREGULAR:
         raise RecordingError(f"{read.path}: {100.0 * share:.0f} % of the steps between its stamps fit no sample period "
-                             "(a clock that was set while recording, or two rigs on one topic), so no verdict is "
+                             "(a clock that was set while recording, or two programs on one topic), so no verdict is "
                              "possible; record again")
 
 

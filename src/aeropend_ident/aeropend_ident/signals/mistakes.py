@@ -33,6 +33,9 @@ RARE = (1.0, 99.0)
 ABSURD = 100.0
 """Ratio of the range of speed, current or voltage to the simulated one from which no result can be right (choice)."""
 
+JUMPS = "faster than any arm turns"
+"""What is said of an angle that jumps."""
+
 FASTEST = 100.0
 """[rad/s] Speed that no arm reaches (choice: 16 turns a second)."""
 
@@ -131,6 +134,8 @@ UNITS = {
     "i_a": (Unit("mA", 1e3),),
     "v_a": (Unit("mV", 1e3),),
 }
+TURN_COUNTS = (256, 360, 400, 512, 1000, 1024, 2000, 2048, 2400, 3600, 4000, 4096, 8192, 10000, 16384)
+"""Counts of a turn of common encoders and converters (choice)."""
 OWN = {"theta": "rad", "omega": "rad/s", "i_a": "A", "v_a": "V"}
 NAMES = {"theta": "angle", "omega": "speed", "i_a": "current", "v_a": "voltage"}
 OPTIONS = {"theta": "theta", "omega": "omega", "i_a": "current", "v_a": "voltage"}
@@ -276,7 +281,8 @@ def _turned_duty(readings: Mapping[str, Array], duty: Array, period: float, mode
         return None
     for other, what, options in (
             (-duty, "turned over (the rig follows it with the other sign)", ("--duty duty:-100%",)),
-            (1.0 - duty, "inverted (the rig follows 1 - duty)", ("--duty duty:counts:1..0",))):
+            (1.0 - duty, "inverted (the rig follows 1 - duty)", ("--duty duty:counts:1..0",)),
+            (0.5 * (1.0 + duty), "-1 without drive (the rig follows half of 1 + duty)", ("--duty duty:counts:-1..1",))):
         if np.abs(other).max() <= 1.0 and _largest_error(
                 readings, record(model, other, period=period)[0]) < min(FITS, own / BETTER):
             return Mistake(f"it looks as if the duty is {what}", sure=True, options=options)
@@ -333,7 +339,7 @@ def _slipped(theta: Array, period: float) -> Mistake | None:
     if not len(jumps):
         return None
     at = jumps[0]
-    return Mistake(f"the angle jumps by {steps[at]:.2g} rad at {known[at] * period:.1f} s, faster than any arm turns: "
+    return Mistake(f"the angle jumps by {steps[at]:.2g} rad at {known[at] * period:.1f} s, {JUMPS}: "
                    "its zero was set there, or it slipped; record again", sure=True)
 
 
@@ -406,12 +412,18 @@ def _of_channel(name: str, x: Array, y: Array, *, same_rig: bool) -> Mistake | N
     if abs(r) < FOLLOWS:
         return None
     unit = next((u for u in UNITS[name] if 1.0 / CLOSE < ratio / u.ratio < CLOSE), None)
+    if name == "theta" and ratio > CLOSE and (y == np.rint(y)).all():
+        most = min(TURN_COUNTS, key=lambda n: abs(math.log(ratio * math.tau / n)))
+        counts = Unit(f"counts:{most}", most / math.tau)
+        if unit is None or abs(math.log(ratio / unit.ratio)) > abs(math.log(ratio / counts.ratio)):
+            unit = counts
     turned = r < 0.0
     against = f"it goes {'against' if turned else 'with'} the simulated one, {ratio:.3g} times as far"
     size = 1.0 if unit is None else unit.ratio
     zero = float(np.median(y - (-size if turned else size) * x))
     off = name == "theta" and 1.0 / CLOSE < ratio / size < CLOSE and abs(zero) > OFF_ZERO * size
-    hangs = f"{zero:.3f}rad" if unit is None else f"{zero:.3g}{unit.name}"
+    hangs = (f"{zero:.3f}rad" if unit is None else f"{zero:.0f}" if unit.name.startswith("counts")
+             else f"{zero:.3g}{unit.name}")
     options = (f"--zero {hangs}",) if off else ()
     if unit is not None:
         what = f"is in {unit.name}{' and turned over' * turned}"
