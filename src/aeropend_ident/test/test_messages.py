@@ -138,3 +138,9 @@ def test_a_table_that_is_no_bag_names_the_command_that_makes_one(tmp_path):
     (tmp_path / "a b.csv").write_text("t,theta\n0,1\n")
     with pytest.raises(RecordingError, match=r"if it is a table, `.*import '.*a b.csv'` shows how to make a recording"):
         read(tmp_path / "a b.csv")
+
+
+def test_an_angle_that_wraps_at_a_turn_is_no_slip(bags, tmp_path, columns):
+    wrapped = bags.content(len(columns["duty"]), columns=columns | {"theta": columns["theta"] % (2.0 * np.pi)})
+    bag = bags.write(tmp_path / "bag", wrapped)
+    assert not any("it slipped" in c.text or c.level == "error" for c in checks(str(bag), BENCH))

@@ -206,7 +206,7 @@ def likely_mistakes(read: Recording, model: Model, mounting: Mounting | None = N
         model: the nominal model.
         mounting: of the angle's sensor, if it is known.
     """
-    piece = longest_piece(read)
+    piece = longest_piece(replace(read, theta=joined_turns(read.theta)[0]))
     if not piece.period > 0.0 or piece.duration > MOST_MISSING * len(piece) * piece.period:
         return []
     index, period = regular_grid(piece)
