@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `diagnose` would say of an effect of some size: the conditions of its search and of its verdict, linearised.
+
+The rig's numbers are drawn within their tolerance; noise is that of the planned recording. Each draw is used with its
+mirror image: the mean over both has no term in which noise and effect are multiplied, so that what is said holds with a
+probability of one half.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.priors import TOLERANCE, usual_size
+from aeropend_ident.diagnosis.chain.values import CHANNELS_OF
+from aeropend_ident.diagnosis.gap_share import headline, shares
+from aeropend_ident.diagnosis.isolation.free_runs import FreeRuns
+from aeropend_ident.diagnosis.isolation.linear import Column, LinearStages, Residuals, Screening
+from aeropend_ident.diagnosis.isolation.planned import SEED
+from aeropend_ident.diagnosis.joint_fit import SURE, WIDER
+from aeropend_ident.diagnosis.policy import CALIBRATED, CERTAIN, MATERIAL, MATERIAL_SHARE
+from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, stages_of
+from aeropend_ident.diagnosis.search.selection import squared_gap
+from aeropend_ident.estimation.map_fit import Fit, largest_ess
+from aeropend_ident.estimation.parameter import Parameter
+from aeropend_sim.model.effects import DEFINED
+
+Array = NDArray[np.float64]
+
+SIZES = (0.1, 1.0, 3.0)
+"""Sizes of a rival, in usual sizes, besides that from which a search starts, at which it is linearised (choice)."""
+
+RIVALS = 4
+"""Rivals that are fitted with all their columns after the screening (as `selection.CONTENDERS`)."""
+
+MIRRORS = (1.0, -1.0)
+"""The noise, and its mirror image."""
+
+LEAST = 1e-7
+"""Square of a size over that wanted which counts as none (choice: far below any that matters)."""
+
+RIGS = 2
+"""Draws of the rig's numbers within their tolerance (choice: two, each with its mirror image).
+
+They matter for effects that a number imitates until it is at the end of its prior."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """An effect that the rig has.
+
+    Attributes:
+        hypothesis: that names it.
+        usual: distance of its usual size from the neutral one, with its sign.
+        stages: whose residuals it changes.
+    """
+
+    hypothesis: Hypothesis
+    usual: float
+    stages: tuple[str, ...]
+
+    @property
+    def size(self) -> Parameter:
+        """The size."""
+        return self.hypothesis.own[0]
+
+    @property
+    def unit(self) -> str:
+        """Unit of the size."""
+        return DEFINED[self.hypothesis.effect].parameters[DEFINED[self.hypothesis.effect].size].unit
+
+    @property
+    def largest(self) -> float:
+        """The largest size, as a distance from the neutral one."""
+        return (self.size.high if self.usual > 0.0 else -self.size.low) - math.copysign(1.0, self.usual) * self.size.mean
+
+    def values(self, size: float) -> dict[str, float]:
+        """Values with a size, as a distance from the neutral one; other parameters at their defaults."""
+        effect = DEFINED[self.hypothesis.effect]
+        own = {f"{effect.id}.{n}": p.neutral if p.refines else p.default for n, p in effect.parameters.items()}
+        return {**own, self.size.name: self.size.mean + math.copysign(size, self.usual)}
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A hypothesis, linearised at several points: one alternative each.
+
+    Attributes:
+        hypothesis: what it is.
+        stages: whose residuals it changes.
+        alternatives: the columns of each.
+        instead: name of the nominal parameter that it fits in its own way.
+    """
+
+    hypothesis: Hypothesis
+    stages: tuple[str, ...]
+    alternatives: tuple[tuple[Column, ...], ...]
+    instead: str = ""
+
+
+class Judge:
+    """Says what a diagnosis of a planned recording would say.
+
+    Args:
+        chains: cut, of the recording of a rig that is like the model.
+        hypotheses: that a diagnosis would try, other forms among them.
+        material: share of the gap from which an effect is claimed.
+    """
+
+    def __init__(self, chains: CutChains, hypotheses: Sequence[Hypothesis], material: float = MATERIAL_SHARE) -> None:
+        self.chains, self.material = chains, material
+        self.linear = LinearStages(chains)
+        self.free = FreeRuns(chains, self.linear.parameters)
+        self.acts_on = {h.name: tuple(b for b in stages_of(chains, h) if b in self.linear.stages) for h in hypotheses}
+        self.hypotheses = [h for h in hypotheses if self.acts_on[h.name]]
+        self._noise: dict[tuple[str, ...], list[dict[str, float]]] = {}
+        rng = np.random.default_rng(SEED)
+        rigs = rng.uniform(-TOLERANCE, TOLERANCE, (RIGS, len(self.linear.parameters)))
+        self._draws = [{c: mirror * x for c, x in self.linear.of_rig(z).items()} for z in rigs for mirror in MIRRORS]
+
+    # ---- hypotheses
+
+    @cached_property
+    def rivals(self) -> dict[str, tuple[list[Rival], Screening]]:
+        """First stage that they change -> the hypotheses, linearised."""
+        all_ = [self._of_parameter(h) if h.parameter else self._of_effect(h) for h in self.hypotheses]
+        flat = [Rival(r.hypothesis, r.stages, (own,), r.instead) for r in all_ for own in r.alternatives]
+        found = {}
+        for stage in self.linear.stages:
+            mine = [r for r in flat if r.stages[0] == stage]
+            found[stage] = (mine, Screening(self.linear, [r.alternatives[0] for r in mine]))
+        return found
+
+    def truth(self, h: Hypothesis) -> Truth:
+        """A hypothesis as the truth."""
+        size = DEFINED[h.effect].parameters[DEFINED[h.effect].size]
+        usual = usual_size(h.effect, self.chains.model) - size.neutral
+        return Truth(h, usual, self.acts_on.get(h.name, ()))
+
+    def _of_parameter(self, h: Hypothesis) -> Rival:
+        p = h.own[0]
+        column = self.linear.column_of(p.name)
+        (known,) = (q for q in self.linear.parameters if q.name == p.name)
+        wider = p.sd / known.sd
+        own = Column({c: wider * x for c, x in column.rows.items()}, p.to_standard(p.low), p.to_standard(p.high))
+        return Rival(h, self.acts_on[h.name], ((own,),), p.name)
+
+    def _of_effect(self, h: Hypothesis) -> Rival:
+        stages, usual = self.acts_on[h.name], abs(self.truth(h).usual)
+        linear = DEFINED[h.effect].linear_in
+        points = (h.starts[0], h.starts[-1]) if linear else h.starts
+        alternatives: list[tuple[Column, ...]] = []
+        for share in (None, *SIZES):
+            columns = []
+            for own in points:
+                head = own[0]
+                at = head.begin if share is None else head.mean + math.copysign(share * usual, head.begin - head.mean)
+                at = min(max(at, head.low), head.high)
+                z = head.to_standard(at)
+                change = self.linear.change({**{p.name: p.begin for p in own}, head.name: at}, stages)
+                low, high = (-np.inf, np.inf) if linear == "polar" else (
+                    head.to_standard(head.low), head.to_standard(head.high))
+                if change:
+                    columns.append(Column({c: x / z for c, x in change.items()}, low, high))
+            pairs = list(zip(columns, columns[1:], strict=False))
+            alternatives += pairs or [(c,) for c in columns]
+        return Rival(h, stages, tuple(alternatives))
+
+    # ---- one effect at one size
+
+    def margin(self, truth: Truth, size: float) -> float:
+        """Log of the size over that from which a stage is searched and an effect is accepted: the median over rigs."""
+        change = self.linear.change(truth.values(size), truth.stages[:1])
+        margins = []
+        for r, noise in zip(self._residuals(change, truth.stages[:1]), self._alone(truth.stages[:1]), strict=True):
+            left = _squares(self.linear.fit(r))
+            searched = max(left[c] - 1.0 for c in left) / (0.5 * MATERIAL**2)
+            explained = max(left[c] - noise[c] for c in left) / MATERIAL**2
+            margins.append(0.5 * math.log(max(min(searched, explained), LEAST)))
+        return float(np.median(margins))
+
+    def _alone(self, stages: tuple[str, ...]) -> list[dict[str, float]]:
+        """Channel -> mean square that the nominal model leaves of noise alone, for each rig."""
+        if stages not in self._noise:
+            self._noise[stages] = [_squares(self.linear.fit(r)) for r in self._residuals({}, stages)]
+        return self._noise[stages]
+
+    def is_sure(self, truth: Truth, size: float) -> bool:
+        """Whether an effect that the search accepts has evidence, is certain after the joint fit, and is claimed."""
+        values = truth.values(size)
+        rs = self._residuals(change := self.linear.change(values, truth.stages), truth.stages)
+        own, z = self._own(truth, size, change)
+        base, fitted = [self.linear.fit(r) for r in rs], [self.linear.fit(r, own) for r in rs]
+        gain = _mean([_gain(f, g) for f, g in zip(base, fitted, strict=True)]) + truth.hypothesis.log_odds
+        unsure = WIDER * fitted[0].sd["own0"] / z
+        if gain <= 0.0 or (gain <= CERTAIN and unsure * SURE > 1.0):
+            return False
+        rest = self.free.rest_of(self.free.change(values))
+        h = truth.hypothesis
+        said = [headline([part, *self.free.rest], shares([part, *self.free.rest]), self.material).verdict
+                for part in (self.free.part(h.name, h.place, rest, mirror, unsure) for mirror in MIRRORS)]
+        return any(verdict != "none" for verdict in said)
+
+    def _residuals(self, change: Residuals, stages: Collection[str]) -> tuple[Residuals, ...]:
+        return tuple({c: e - change.get(c, 0.0) for c, e in draw.items() if self.linear.stage_of[c] in stages}
+                     for draw in self._draws)
+
+    def _own(self, truth: Truth, size: float, change: Residuals) -> tuple[tuple[Column, ...], float]:
+        """The column of an effect at its size, and that size in standard deviations of its prior."""
+        z = abs(truth.size.to_standard(truth.size.mean + math.copysign(size, truth.usual)))
+        return (Column({c: x / z for c, x in change.items()}),), z
+
+    # ---- rivals
+
+    def probabilities(self, truth: Truth, size: float) -> dict[str, float]:
+        """Family -> probability in the first stage that the effect changes, of those that are compared to their end.
+
+        Args:
+            truth: the effect.
+            size: of it, as a distance from the neutral one.
+        """
+        change = self.linear.change(truth.values(size), truth.stages)
+        first = truth.stages[0]
+        rivals, screening = self.rivals[first]
+        stages = tuple({b: None for r in rivals for b in r.stages} | dict.fromkeys(truth.stages))
+        rs = self._residuals(change, stages)
+        base = [self.linear.fit(r) for r in rs]
+        short = self._short(truth, rivals, screening.explained(rs[0], base[0]))
+        tried = [(truth.hypothesis, [self.linear.fit(r, self._own(truth, size, change)[0]) for r in rs])]
+        tried += [(one.hypothesis, [self.linear.fit(r, one.alternatives[0], instead=one.instead) for r in rs])
+                  for one in short]
+        gains = [_mean([_gain(b, f) for b, f in zip(base, fits, strict=True)]) + h.log_odds for h, fits in tried]
+        open_, *left = (_mean([squared_gap(self.chains, f, CHANNELS_OF[first]) for f in fits])
+                        for fits in (base, *(fits for _, fits in tried)))
+        most = min(left) + MATERIAL_SHARE * open_
+        best: dict[str, float] = {}
+        for (h, _), gain, x in zip(tried, gains, left, strict=True):
+            if x <= most:
+                best[h.family] = max(best.get(h.family, -np.inf), gain)
+        total = np.logaddexp.reduce([0.0, *best.values()])
+        return {name: math.exp(gain - total) for name, gain in best.items()}
+
+    @staticmethod
+    def _short(truth: Truth, rivals: Sequence[Rival], explained: Array) -> list[Rival]:
+        """The rivals of the other families that explain most, with their forms, each at its best alternative."""
+        best: dict[str, Rival] = {}
+        families: set[str] = {truth.hypothesis.family}
+        for k in np.argsort(-explained):
+            h = rivals[k].hypothesis
+            if h.name not in best and h.family != truth.hypothesis.family and (
+                    h.family in families or len(families) <= RIVALS):
+                families.add(h.family)
+                best[h.name] = rivals[k]
+        return list(best.values())
+
+    def rivals_of(self, truth: Truth, size: float) -> dict[str, float] | None:
+        """Family of each rival that is not ruled out -> its probability; None if the verdict names another effect."""
+        found = self.probabilities(truth, size)
+        own = truth.hypothesis.family
+        if max(found, key=lambda n: found[n], default="") != own:
+            return None
+        return {name: p for name, p in found.items() if name != own and p > CALIBRATED.undecided}
+
+
+def _gain(base: Fit, f: Fit) -> float:
+    """Log evidence of a fit over that without its hypothesis."""
+    ess = largest_ess([base, f])
+    return f.log_evidence(ess) - base.log_evidence(ess)
+
+
+def _squares(f: Fit) -> dict[str, float]:
+    """Channel -> mean square of what a fit leaves."""
+    return {c: float(np.mean(r * r)) for c, r in f.residuals.items()}
+
+
+def _mean(x: Sequence[float]) -> float:
+    return float(np.mean(x))

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The smallest size of an effect that a planned recording would show, and that at which the effect would be named."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from aeropend_ident.diagnosis.isolation.judge import Judge, Truth
+
+LARGEST = 10.0
+"""Largest size that is tried, in usual sizes (choice: a rig that is so far from its model is no rig any more)."""
+
+FIRST = 0.05
+"""First size that is tried, in usual sizes (choice: about where effects of `bench` begin to show)."""
+
+NEAR = 0.02
+"""Relative change of a size below which a search for it ends (choice: far below the scatter of noise)."""
+
+FACTOR = 1.25
+"""Factor between two sizes of a scan (choice: half of it is far below the scatter of noise)."""
+
+MOST_STEPS = 20
+"""Steps of a search at most (choice: it needs four to six)."""
+
+
+@dataclass(frozen=True)
+class Smallest:
+    """The smallest sizes of an effect with which a diagnosis would say something, with a probability of one half.
+
+    Attributes:
+        seen: size at which it would not say `none`, as a distance from the neutral one; None: not at all.
+        named: size at which it would name the effect and no rival; None: not at all.
+        rivals: family of each rival that it could not rule out at the size seen -> its probability.
+    """
+
+    seen: float | None
+    named: float | None
+    rivals: dict[str, float]
+
+
+def smallest(judge: Judge, truth: Truth, *, name: bool = True) -> Smallest:
+    """The smallest sizes of an effect.
+
+    Args:
+        judge: of the planned recording.
+        truth: the effect.
+        name: whether the size at which it is named is looked for too.
+    """
+    if not truth.stages:
+        return Smallest(None, None, {})
+    largest = min(LARGEST * abs(truth.usual), truth.largest)
+    shown = _crossing(lambda size: judge.margin(truth, size), FIRST * abs(truth.usual), largest)
+    seen = None if shown is None else _first(lambda size: judge.is_sure(truth, size), shown, largest)
+    if seen is None or not name:
+        return Smallest(seen, None, {})
+    rivals = judge.rivals_of(truth, seen)
+    named = _first(lambda size: judge.rivals_of(truth, size) == {}, seen, largest)
+    return Smallest(seen, named, judge.probabilities(truth, seen) if rivals is None else rivals)
+
+
+def _crossing(margin: Callable[[float], float], first: float, largest: float) -> float | None:
+    """The size at which a margin, about the log of the size over that wanted, becomes 0; None above the largest."""
+    size, low, high = min(first, largest), 0.0, math.inf
+    for _ in range(MOST_STEPS):
+        m = margin(size)
+        if abs(m) < NEAR:
+            return size
+        low, high = (size, high) if m < 0.0 else (low, size)
+        if low >= largest:
+            return None
+        size *= math.exp(min(max(-m, -2.0), 1.5))
+        if not low < size < high or (low > 0.0 and high < (1.0 + NEAR) * low):
+            if low > 0.0 and high < (1.0 + NEAR) * low:
+                return high
+            size = math.sqrt(low * high) if low > 0.0 else 0.5 * high
+        size = min(size, largest)
+    return high if math.isfinite(high) else None
+
+
+def _first(holds: Callable[[float], bool], start: float, largest: float) -> float | None:
+    """The first size of a scan from a start at which something holds, halfway to the one before; None: at none."""
+    size = start
+    if holds(size):
+        return size
+    while size < largest:
+        size, before = min(2.0 * size, largest), size
+        if holds(size):
+            while size > FACTOR * before:
+                middle = math.sqrt(size * before)
+                size, before = (middle, before) if holds(middle) else (size, middle)
+            return math.sqrt(size * before)
+    return None
