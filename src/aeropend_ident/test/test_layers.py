@@ -21,7 +21,7 @@ LAYERS = [
     ["diagnosis.joint_fit", "diagnosis.validation", "diagnosis.experiment_design"],
     ["diagnosis.strength"],
     ["diagnosis.conclude", "diagnosis.gap_share", "diagnosis.gap_budget"],
-    ["diagnosis.since"],
+    ["diagnosis.since", "diagnosis.isolation"],
     ["diagnosis.diagnosis"],
     ["diagnosis.report"],
     ["diagnosis.results", "diagnosis.checks"],

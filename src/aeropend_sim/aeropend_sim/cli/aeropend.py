@@ -19,6 +19,7 @@ PURPOSES = {
         "live": "simulate a rig that changes while it runs, and watch it",
         "watch": "run the model beside a rig and tell when they part",
         "doctor": "check the installation, recordings and model files",
+        "isolate": "say before a recording which effects it would show",
         "excitation_quality": "check how well an input excites each term of the model",
         "precompile": "compile now what the first diagnosis would wait for",
     },

@@ -29,7 +29,7 @@ from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, stages_of
 from aeropend_ident.diagnosis.search.selection import squared_gap
 from aeropend_ident.estimation.map_fit import Fit, largest_ess
 from aeropend_ident.estimation.parameter import Parameter
-from aeropend_sim.model.effects import DEFINED
+from aeropend_sim.model.effects import DEFINED, RANDOM
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ SIZES = (0.1, 1.0, 3.0)
 """Sizes of a rival, in usual sizes, besides that from which a search starts, at which it is linearised (choice)."""
 
 RIVALS = 4
-"""Rivals that are fitted with all their columns after the screening (as `selection.CONTENDERS`)."""
+"""Rivals that are fitted after the screening (choice: as many as contend in a diagnosis)."""
 
 MIRRORS = (1.0, -1.0)
 """The noise, and its mirror image."""
@@ -118,7 +118,7 @@ class Judge:
         self.linear = LinearStages(chains)
         self.free = FreeRuns(chains, self.linear.parameters)
         self.acts_on = {h.name: tuple(b for b in stages_of(chains, h) if b in self.linear.stages) for h in hypotheses}
-        self.hypotheses = [h for h in hypotheses if self.acts_on[h.name]]
+        self.hypotheses = list(hypotheses)
         self._noise: dict[tuple[str, ...], list[dict[str, float]]] = {}
         rng = np.random.default_rng(SEED)
         rigs = rng.uniform(-TOLERANCE, TOLERANCE, (RIGS, len(self.linear.parameters)))
@@ -129,7 +129,8 @@ class Judge:
     @cached_property
     def rivals(self) -> dict[str, tuple[list[Rival], Screening]]:
         """First stage that they change -> the hypotheses, linearised."""
-        all_ = [self._of_parameter(h) if h.parameter else self._of_effect(h) for h in self.hypotheses]
+        shown = [h for h in self.hypotheses if self.acts_on[h.name] and h.effect not in RANDOM]
+        all_ = [self._of_parameter(h) if h.parameter else self._of_effect(h) for h in shown]
         flat = [Rival(r.hypothesis, r.stages, (own,), r.instead) for r in all_ for own in r.alternatives]
         found = {}
         for stage in self.linear.stages:

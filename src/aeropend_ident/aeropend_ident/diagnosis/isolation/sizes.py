@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from aeropend_ident.diagnosis.isolation import chance
 from aeropend_ident.diagnosis.isolation.judge import Judge, Truth
 
 LARGEST = 10.0
@@ -48,6 +49,12 @@ def smallest(judge: Judge, truth: Truth, *, name: bool = True) -> Smallest:
         truth: the effect.
         name: whether the size at which it is named is looked for too.
     """
+    if truth.hypothesis.effect == "speed_spikes":
+        rate = chance.spikes(judge)
+        return Smallest(rate, rate if name else None, {})
+    if truth.hypothesis.effect == "gust":
+        size = _crossing(chance.gust_margin(judge, truth), truth.usual, LARGEST * truth.usual)
+        return Smallest(size, size if name else None, {})
     if not truth.stages:
         return Smallest(None, None, {})
     largest = min(LARGEST * abs(truth.usual), truth.largest)

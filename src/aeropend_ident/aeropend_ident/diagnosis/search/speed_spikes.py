@@ -37,17 +37,31 @@ def detect(recordings: Sequence[Signals]) -> RankedHypothesis | None:
     count, time = 0, 0.0
     for s in recordings:
         count += _count(s.false_speed[:s.train])
-        # a false capture needs a pulse: there is none while the rotor stands
-        time += float(s.pulses.period[s.pulses.index < s.train].sum()) if s.pulses else s.train * s.period
-    if count < FEWEST:
-        return None
-    expected = ANY_RIG * time
-    gain = count * math.log(count / expected) - (count - expected) + math.log(EFFECT_ODDS)
-    if gain < 0.0:
+        time += searched_time(s)
+    gain = log_odds(count, time)
+    if count < FEWEST or gain < 0.0:
         return None
     name = "speed_spikes.rate"
     rate, sd = count / time, math.sqrt(count) / time
     return RankedHypothesis(Hypothesis("speed_spikes"), estimate({name: rate}, {name: sd}), gain, float(expit(gain)))
+
+
+def log_odds(count: int, time: float) -> float:
+    """Log odds that false captures come more often than on any rig.
+
+    Args:
+        count: of them; at least 1.
+        time: [s] in which they came.
+    """
+    expected = ANY_RIG * time
+    if count < 1 or expected <= 0.0:
+        return -math.inf
+    return count * math.log(count / expected) - (count - expected) + math.log(EFFECT_ODDS)
+
+
+def searched_time(s: Signals) -> float:
+    """[s] Time of the fitted part in which a false capture could come: it needs a pulse, and a rotor that turns."""
+    return float(s.pulses.period[s.pulses.index < s.train].sum()) if s.pulses else s.train * s.period
 
 
 def left_out(s: Signals) -> tuple[str, ...]:
