@@ -3,7 +3,7 @@
 
     python -m evaluation.isolate --seed 90210                   64 recordings of 25 s
     python -m evaluation.isolate --effects brush_drop gust      only these effects
-    python -m evaluation.isolate --docs                         the table of the last run goes into docs/results/isolate.md
+    python -m evaluation.isolate --docs                         write the table of the last run into its page
 
 Effects are drawn by size around the predicted ones, in rigs of the independent plant whose numbers are up to 5 % off.
 Each recording is diagnosed. Whether the effect is seen, and whether it is named, are probits of the log of its size;
@@ -152,12 +152,12 @@ def score(out: Path) -> str:
     not_alone = [not a for a, r in zip(alone, above, strict=True) if not r["separable"]]
     lines = [f"{what}: {sum(max(x, 1.0 / x) <= NEAR for x in each)} of {len(each)} within a factor {NEAR} (target 90 %)"
              for what, each in ratios.items()]
-    lines += [f"separable or not, of the recordings whose verdict is not `none`: {sum(right)} of {len(right)} as predicted",
+    lines += [f"separable or not, where the verdict is not `none`: {sum(right)} of {len(right)} as predicted",
               f"predicted not separable, and so: {sum(not_alone)} of {len(not_alone)} (target 95 %)"]
     machine = run["machine"]
     return "\n".join([*page.markdown(table), "", *(f"- {line}" for line in lines), "",
-                      f"Measured on {run['date']}: {run['count']} recordings of {run['duration']:g} s, seed {run['seed']}, "
-                      f"commit {machine['commit']}, {machine['cpu']}, Python {machine['python']}."])
+                      (f"Measured on {run['date']}: {run['count']} recordings of {run['duration']:g} s, seed "
+                       f"{run['seed']}, commit {machine['commit']}, {machine['cpu']}, Python {machine['python']}.")])
 
 
 def main() -> None:

@@ -29,7 +29,10 @@ BENCH = load("bench")
 DUTY = Excitation(duration=10.0, duty_max=0.6).series()
 
 
-def judged(model=BENCH, channels=tuple(CHANNELS), effects=("coulomb_friction", "thrust_lag", "current_gain"), further=()):
+FEW = ("coulomb_friction", "thrust_lag", "current_gain")
+
+
+def judged(model=BENCH, channels=tuple(CHANNELS), effects=FEW, further=()):
     """A judge of a few effects, without rivals of no interest."""
     chains = CutChains(model, [planned(model, DUTY, channels)])
     return Judge(chains, [h for h in hypotheses(model, further) if h.effect in (*effects, *further)])
@@ -163,8 +166,8 @@ def test_isolate_says_all_at_once_and_draws_it(monkeypatch):
 
 @pytest.mark.parametrize(("arguments", "said"), [
     (["--channels", "omega"], "add theta"), (["--size", "x=1"], "is no effect"),
-    (["--size", "coulomb_friction=nan"], "give a number above 0"), (["--duration", "5", "--kind", "hold", "--duty-max", "0"],
-                                                                    "nothing happens")])
+    (["--size", "coulomb_friction=nan"], "give a number above 0"),
+    (["--duration", "5", "--kind", "hold", "--duty-max", "0"], "nothing happens")])
 def test_an_experiment_that_cannot_be_planned_is_one_line(arguments, said, capsys):
     assert main(arguments) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()[-1:]

@@ -36,11 +36,11 @@ from aeropend_sim.model.parameters import PRESETS, load
 from aeropend_sim.untrusted import printable
 
 EXAMPLES = f"""examples:
-  isolate                                             a minute of random steps, all channels
-  isolate --model my_rig.yaml --duration 30           a rig of your own, and a shorter recording
+  isolate                                             half a minute of random steps, all channels
+  isolate --model my_rig.yaml --duration 60           a rig of your own, and a longer recording
   isolate --channels theta v_a                        only the angle and the voltage are measured
   isolate --channels theta                            the angle and the command alone
-  isolate --experiment 7                              one of the signals that `diagnose` proposes, 1 to {len(EXPERIMENTS)}
+  isolate --experiment 7                              a signal that `diagnose` proposes, 1 to {len(EXPERIMENTS)}
   isolate my_bag --model my_rig.yaml                  the duty, the channels and the noise of a recording
   isolate --effects my_effects.yaml --forms           effects by formula, and other forms of effects, too
   isolate --size coulomb_friction=0.05                pairs at another size than the usual one
@@ -74,7 +74,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             recorded = partial(planned, model, _signal(options).series())
             channels = options.channels or list(CHANNELS)
-        found = isolate(model, recorded, channels, further, sizes, sensors=not options.no_sensors, jobs=options.jobs,
+        found = isolate(model, recorded, channels, further, sizes, forms=options.forms,
+                        sensors=not options.no_sensors, jobs=options.jobs,
                         progress=lambda what, share: show(share, what))
     if html is not None:
         try:
@@ -84,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.json:
         print(json.dumps(typed_json.to_json(found), indent=1, ensure_ascii=False))
     else:
-        print_tables(found, forms=options.forms)
+        print_tables(found)
     if html is not None:
         print(printable(str(html)), file=sys.stderr)
     return 0
@@ -103,18 +104,19 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--channels", nargs="+", choices=list(CHANNELS), metavar="CHANNEL",
                         help=f"what is measured besides the command: some of {', '.join(CHANNELS)} (default: all, or "
                              "those of the bag)")
-    parser.add_argument("--kind", choices=list(KINDS), help="kind of the signal, as in `excite`; default latin_hypercube")
+    parser.add_argument("--kind", choices=list(KINDS),
+                        help="kind of the signal, as in `excite`; default latin_hypercube")
     parser.add_argument("--experiment", type=int, choices=range(1, len(EXPERIMENTS) + 1), metavar="N",
                         help=f"number of a signal that `diagnose` proposes, 1 to {len(EXPERIMENTS)}: "
                              + ", ".join(f"{k} {e.kind}" for k, e in enumerate(EXPERIMENTS, 1)))
-    parser.add_argument("--duration", type=between(5.0, LONGEST, "a time", "s"), default=60.0, metavar="S",
-                        help="length of the signal, s; default 60")
+    parser.add_argument("--duration", type=between(5.0, LONGEST, "a time", "s"), default=30.0, metavar="S",
+                        help="length of the signal, s; default 30")
     parser.add_argument("--duty-max", type=between(0.0, 1.0, "a duty"), metavar="X",
                         help="greatest duty of the signal; default that of `excite`")
     parser.add_argument("--seed", type=int, default=0, help="seed of the signal; default 0")
     parser.add_argument("--effects", action="append", default=[], metavar="FILE",
                         help="effect file: effects by formula that are looked at too; may be given several times")
-    parser.add_argument("--forms", action="store_true", help="list the other forms of the effects too")
+    parser.add_argument("--forms", action="store_true", help="list other forms of the effects too: twice the time")
     parser.add_argument("--size", action="append", default=[], metavar="EFFECT=X",
                         help="size at which an effect is told from others, in its unit (default: its usual size); may "
                              "be given several times")
@@ -141,7 +143,8 @@ def _signal(options: argparse.Namespace) -> Excitation:
     top = options.duty_max
     if top is None:
         return signal
-    return replace(signal, duty_max=top, duty=min(signal.duty, top), sequence=tuple(min(x, top) for x in signal.sequence))
+    return replace(signal, duty_max=top, duty=min(signal.duty, top),
+                   sequence=tuple(min(x, top) for x in signal.sequence))
 
 
 def _size(text: str) -> tuple[str, float]:
@@ -152,25 +155,21 @@ def _size(text: str) -> tuple[str, float]:
     except ValueError:
         size = math.nan
     if effect not in DEFINED or DEFINED[effect].form_of:
-        raise PlanError(f"--size {text}: '{effect}' is no effect; give one of {', '.join(CATALOGUE)}, or of an effect file")
+        raise PlanError(f"--size {text}: '{effect}' is no effect; give one of {', '.join(CATALOGUE)}, or of an effect "
+                        "file")
     if not size > 0.0 or math.isinf(size):
         raise PlanError(f"--size {text}: give a number above 0, as --size {effect}="
                         f"{abs(DEFINED[effect].parameters[DEFINED[effect].size].default):g}")
     return effect, size
 
 
-def print_tables(found: Isolation, *, forms: bool) -> None:
-    """Print what a recording would show.
-
-    Args:
-        found: what it would show.
-        forms: whether other forms of effects have rows of their own.
-    """
+def print_tables(found: Isolation) -> None:
+    """Print what a recording would show."""
     console = Console(highlight=False)
     if not console.is_terminal:
         console = Console(highlight=False, width=10_000)
-    console.print(printable(f"a recording of {found.seconds:.0f} s of {', '.join(found.channels)}; model {found.model}; "
-                            "each size with a probability of one half"), markup=False)
+    console.print(printable(f"a recording of {found.seconds:.0f} s of {', '.join(found.channels)}; model {found.model};"
+                            " each size with a probability of one half"), markup=False, soft_wrap=True)
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for heading in ("effect", "place"):
         table.add_column(heading)
@@ -178,13 +177,11 @@ def print_tables(found: Isolation, *, forms: bool) -> None:
         table.add_column(heading, justify="right")
     table.add_column("not told from, where it is just seen", overflow="fold")
     for e in found.effects:
-        if forms or not e.form_of:
-            table.add_row(e.effect, e.place, *("not at all" if x is None else quantity(x, e.unit, 2)
-                                               for x in (e.seen, e.named)), quantity(e.usual, e.unit, 2),
-                          ", ".join(e.rivals))
+        sizes = ("not at all" if x is None else quantity(x, e.unit, 2) for x in (e.seen, e.named))
+        table.add_row(e.effect, e.place, *sizes, quantity(e.usual, e.unit, 2), ", ".join(e.rivals))
     console.print(table)
     for line in lines(found):
-        console.print(printable(line), markup=False)
+        console.print(printable(line), markup=False, soft_wrap=True)
 
 
 def lines(found: Isolation) -> list[str]:
@@ -212,10 +209,11 @@ def _of_sensor(s: Sensor) -> str:
     known = {e: f for e, f in s.factor.items() if f is not None and f > 0.0}
     worth = sorted((e for e, f in known.items() if max(f, 1.0 / f) > USUAL), key=lambda e: -abs(math.log(known[e])))
     lost, won = [e for e, f in s.factor.items() if f is None], [e for e, f in s.factor.items() if f == 0.0]
-    parts = [f"{known[e]:.2g} times the smallest size of {e}" for e in worth]
-    parts += [f"{e} is no longer seen" for e in lost] + [f"{e} is seen only then" for e in won]
-    name = f"{'with' if s.added else 'without'} {s.channel}"
-    return f"{name}: {'; '.join(parts) if parts else f'no size changes by more than a factor {USUAL:g}; it can be spared' if not s.added else f'no size changes by more than a factor {USUAL:g}; it is not needed'}"
+    parts = [f"smallest sizes {', '.join(f'{e} ×{known[e]:.2g}' for e in worth)}"] if worth else []
+    parts += [f"no longer seen: {', '.join(lost)}"] if lost else []
+    parts += [f"seen only then: {', '.join(won)}"] if won else []
+    spared = f"no size changes by more than a factor {USUAL:g}: it {'is not needed' if s.added else 'can be spared'}"
+    return f"{'with' if s.added else 'without'} {s.channel}: {'; '.join(parts) or spared}"
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ def spikes(judge: Judge) -> float | None:
     return float(gammaincinv(enough, 0.5)) / time  # a Poisson number reaches n with this probability
 
 
-def gust_margin(judge: Judge, truth: Truth) -> Callable[[float], float]:
+def gust_margin(judge: Judge, truth: Truth) -> Callable[..., float]:
     """Size -> log of what the arm leaves over that from which a random torque is looked for, by one random torque.
 
     Args:
@@ -45,7 +45,8 @@ def gust_margin(judge: Judge, truth: Truth) -> Callable[[float], float]:
     model, (s,) = judge.chains.model, judge.chains.recordings
     still, _ = rig.record(model, s.duty, SEED, s.period)
 
-    def margin(size: float) -> float:
+    def margin(size: float, *, roughly: bool = False) -> float:
+        del roughly
         own = {n.partition(".")[2]: v for n, v in truth.values(size).items()}
         moved, _ = rig.record(model.with_effects({**model.effects, "gust": own}), s.duty, SEED, s.period)
         change = ((moved["theta"] - still["theta"])[:s.train] / s.sigma["theta"])[np.isfinite(s.theta[:s.train])]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The share of an effect in the gap of a planned recording, as the verdict would measure it; linear in the parameters."""
+"""The share of an effect in the gap of a planned recording, as the verdict would measure it, linear in the numbers."""
 
 from __future__ import annotations
 
@@ -93,6 +93,6 @@ class FreeRuns:
         amount = float(np.mean(square.sum(axis=1) / np.maximum(known.sum(axis=1), 1.0)))
         width = max(1, round(WINDOW / self.signals.period))
         edges = np.arange(0, max(square.shape[1] - width, 0) + 1, width)
-        windows = [float(np.mean(square[:, a:a + width].sum(axis=1) / np.maximum(known[:, a:a + width].sum(axis=1), 1.0)))
-                   for a in edges]
+        in_each = [(square[:, a:a + width].sum(axis=1), known[:, a:a + width].sum(axis=1)) for a in edges]
+        windows = [float(np.mean(x / np.maximum(n, 1.0))) for x, n in in_each]
         return Part(name, place, amount, np.array(windows), unsure)

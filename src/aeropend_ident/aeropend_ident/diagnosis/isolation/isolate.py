@@ -123,7 +123,8 @@ class Isolation:
     structural: Mapping[str, Structural]
 
 
-def judge_of(model: Model, signals: Signals, further: Sequence[str] = (), material: float = MATERIAL_SHARE) -> Judge:
+def judge_of(model: Model, signals: Signals, further: Sequence[str] = (), material: float = MATERIAL_SHARE, *,
+             rivals: bool = True) -> Judge:
     """The judge of a planned recording.
 
     Args:
@@ -131,16 +132,20 @@ def judge_of(model: Model, signals: Signals, further: Sequence[str] = (), materi
         signals: the planned recording, of a rig that is like it.
         further: ids of effects of effect files.
         material: share of the gap from which an effect is claimed.
+        rivals: whether effects are told from rivals: parameters that are far off, and other forms, count only then.
     """
     chains = CutChains(model, [signals])
     chains.further = tuple(further)
-    every = hypotheses(model, further)
+    every = hypotheses(model, further, mismatches=rivals)
+    if not rivals:
+        return Judge(chains, [h for h in every if not DEFINED[h.effect].form_of], material)
     return Judge(chains, [*every, *(form for h in every for form in other_forms(h, chains))], material)
 
 
 def isolate(model: Model, recorded: Callable[[Sequence[str]], Signals], channels: Sequence[str],
-            further: Sequence[str] = (), sizes: Mapping[str, float] | None = None, *, sensors: bool = True,
-            material: float = MATERIAL_SHARE, jobs: int = 1, progress: Progress = lambda *_: None) -> Isolation:
+            further: Sequence[str] = (), sizes: Mapping[str, float] | None = None, *, forms: bool = False,
+            sensors: bool = True, material: float = MATERIAL_SHARE, jobs: int = 1,
+            progress: Progress = lambda *_: None) -> Isolation:
     """Say what a planned recording would show.
 
     Args:
@@ -149,6 +154,7 @@ def isolate(model: Model, recorded: Callable[[Sequence[str]], Signals], channels
         channels: that are measured.
         further: ids of effects of effect files.
         sizes: effect -> size at which pairs are told apart, as a distance from the neutral one; else the usual size.
+        forms: whether the smallest sizes of other forms of effects are computed too.
         sensors: whether other sets of channels are tried.
         material: share of the gap from which an effect is claimed.
         jobs: threads; the result does not depend on them.
@@ -162,7 +168,8 @@ def isolate(model: Model, recorded: Callable[[Sequence[str]], Signals], channels
         there = tuple(c for c in CHANNELS if signals.has(c))
         progress("linearising the model", 0.0)
         judge = judge_of(model, signals, further, material)
-        truths = [judge.truth(h) for h in judge.hypotheses if not h.parameter]
+        truths = [judge.truth(h) for h in judge.hypotheses
+                  if not h.parameter and (forms or not DEFINED[h.effect].form_of)]
         progress("computing the smallest sizes", 0.2)
         _ = judge.rivals  # once, before threads share them
         found = list(pool.map(partial(smallest, judge), truths))
@@ -200,11 +207,9 @@ def _sensor(model: Model, recorded: Callable[[Sequence[str]], Signals], channels
     """The factor on the smallest size of each effect of the catalogue, with a channel more or less."""
     added = channel not in channels
     other = [c for c in CHANNELS if (c in channels) != (c == channel)]
-    judge = judge_of(model, recorded(other), further, material)
+    judge = judge_of(model, recorded(other), further, material, rivals=False)
     factor: dict[str, float | None] = {}
     for h in judge.hypotheses:
-        if h.parameter or DEFINED[h.effect].form_of:
-            continue
         now, before = smallest(judge, judge.truth(h), name=False).seen, seen[h.effect]
         if now is None and before is None:
             continue

@@ -12,6 +12,7 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,7 +79,7 @@ class Truth:
     @property
     def largest(self) -> float:
         """The largest size, as a distance from the neutral one."""
-        return (self.size.high if self.usual > 0.0 else -self.size.low) - math.copysign(1.0, self.usual) * self.size.mean
+        return self.size.high - self.size.mean if self.usual > 0.0 else self.size.mean - self.size.low
 
     def values(self, size: float) -> dict[str, float]:
         """Values with a size, as a distance from the neutral one; other parameters at their defaults."""
@@ -117,7 +118,7 @@ class Judge:
         self.chains, self.material = chains, material
         self.linear = LinearStages(chains)
         self.free = FreeRuns(chains, self.linear.parameters)
-        self.acts_on = {h.name: tuple(b for b in stages_of(chains, h) if b in self.linear.stages) for h in hypotheses}
+        self.acts_on = {h.name: self._stages(h) for h in hypotheses}
         self.hypotheses = list(hypotheses)
         self._noise: dict[tuple[str, ...], list[dict[str, float]]] = {}
         rng = np.random.default_rng(SEED)
@@ -125,6 +126,13 @@ class Judge:
         self._draws = [{c: mirror * x for c, x in self.linear.of_rig(z).items()} for z in rigs for mirror in MIRRORS]
 
     # ---- hypotheses
+
+    def _stages(self, h: Hypothesis) -> tuple[str, ...]:
+        """The stages with a measured channel whose residuals a hypothesis changes."""
+        if h.parameter:
+            shown = {self.linear.stage_of[c] for c in self.linear.column_of(h.parameter).rows}
+            return tuple(b for b in self.linear.stages if b in shown)
+        return tuple(b for b in stages_of(self.chains, h) if b in self.linear.stages)
 
     @cached_property
     def rivals(self) -> dict[str, tuple[list[Rival], Screening]]:
@@ -169,17 +177,25 @@ class Judge:
                     head.to_standard(head.low), head.to_standard(head.high))
                 if change:
                     columns.append(Column({c: x / z for c, x in change.items()}, low, high))
-            pairs = list(zip(columns, columns[1:], strict=False))
+            pairs = list(pairwise(columns))
             alternatives += pairs or [(c,) for c in columns]
         return Rival(h, stages, tuple(alternatives))
 
     # ---- one effect at one size
 
-    def margin(self, truth: Truth, size: float) -> float:
-        """Log of the size over that from which a stage is searched and an effect is accepted: the median over rigs."""
+    def margin(self, truth: Truth, size: float, *, roughly: bool = False) -> float:
+        """Log of the size over that from which a stage is searched and an effect is accepted: the median over rigs.
+
+        Args:
+            truth: the effect.
+            size: of it, as a distance from the neutral one.
+            roughly: whether one rig is enough.
+        """
         change = self.linear.change(truth.values(size), truth.stages[:1])
         margins = []
-        for r, noise in zip(self._residuals(change, truth.stages[:1]), self._alone(truth.stages[:1]), strict=True):
+        rigs = len(self._draws) if not roughly else 1
+        rs = self._residuals(change, truth.stages[:1], rigs)
+        for r, noise in zip(rs, self._alone(truth.stages[:1]), strict=False):
             left = _squares(self.linear.fit(r))
             searched = max(left[c] - 1.0 for c in left) / (0.5 * MATERIAL**2)
             explained = max(left[c] - noise[c] for c in left) / MATERIAL**2
@@ -189,7 +205,7 @@ class Judge:
     def _alone(self, stages: tuple[str, ...]) -> list[dict[str, float]]:
         """Channel -> mean square that the nominal model leaves of noise alone, for each rig."""
         if stages not in self._noise:
-            self._noise[stages] = [_squares(self.linear.fit(r)) for r in self._residuals({}, stages)]
+            self._noise[stages] = [_squares(self.linear.fit(r)) for r in self._residuals({}, stages, len(self._draws))]
         return self._noise[stages]
 
     def is_sure(self, truth: Truth, size: float) -> bool:
@@ -208,9 +224,10 @@ class Judge:
                 for part in (self.free.part(h.name, h.place, rest, mirror, unsure) for mirror in MIRRORS)]
         return any(verdict != "none" for verdict in said)
 
-    def _residuals(self, change: Residuals, stages: Collection[str]) -> tuple[Residuals, ...]:
+    def _residuals(self, change: Residuals, stages: Collection[str], rigs: int = len(MIRRORS)) -> tuple[Residuals, ...]:
+        """Residuals of some of the rigs, with a change; by default one rig and its mirror image."""
         return tuple({c: e - change.get(c, 0.0) for c, e in draw.items() if self.linear.stage_of[c] in stages}
-                     for draw in self._draws)
+                     for draw in self._draws[:rigs])
 
     def _own(self, truth: Truth, size: float, change: Residuals) -> tuple[tuple[Column, ...], float]:
         """The column of an effect at its size, and that size in standard deviations of its prior."""

@@ -36,7 +36,7 @@ class Column:
     """One direction in which a hypothesis changes the residuals.
 
     Attributes:
-        rows: channel -> (N,) change by one standard deviation of the prior; channels that it does not change are left out.
+        rows: channel -> (N,) change by one standard deviation of the prior, of channels that it changes.
         low: lower bound, in standard deviations.
         high: upper bound.
     """
@@ -94,7 +94,7 @@ class LinearStages:
         return list(dict.fromkeys(self.stage_of.values()))
 
     def change(self, values: Mapping[str, float], stages: Sequence[str]) -> Residuals:
-        """Channel -> (N,) change of the residuals by some values, in the stages given; unchanged channels are left out."""
+        """Channel -> (N,) change of the residuals by some values, in some stages; unchanged channels are left out."""
         out = {}
         for stage in stages:
             own = {p.name: p.mean for p in nominal_parameters(self.chains, stage)}
@@ -105,7 +105,7 @@ class LinearStages:
         return out
 
     def of_rig(self, z: Array) -> Residuals:
-        """Channel -> (N,) residuals of a rig whose numbers are off by z (P,), in standard deviations, with the noise."""
+        """Channel -> (N,) residuals of a rig whose numbers are off by z (P,), in standard deviations; with noise."""
         off = np.where([key(p.name).is_initial for p in self.parameters], 0.0, z)
         return {c: e - off[self.products[c].by] @ self.products[c].rows for c, e in self.noise.items()}
 
@@ -226,7 +226,8 @@ class Screening:
         off = pairs - np.sum(cross[:, i] * solved[:, j], axis=0)
         determinant = square[i] * square[j] - off * off
         with np.errstate(divide="ignore", invalid="ignore"):
-            a, b = (square[j] * pull[i] - off * pull[j]) / determinant, (square[i] * pull[j] - off * pull[i]) / determinant
+            a = (square[j] * pull[i] - off * pull[j]) / determinant
+            b = (square[i] * pull[j] - off * pull[i]) / determinant
             both = a * pull[i] + b * pull[j]
         inside = (i != j) & (determinant > 0.0) & (a >= self.low[i]) & (b >= self.low[j]) & (a <= self.high[i]) & (
             b <= self.high[j])

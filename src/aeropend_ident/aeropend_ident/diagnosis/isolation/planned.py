@@ -61,4 +61,5 @@ def like(model: Model, s: Signals, channels: Collection[str] | None = None) -> S
     noise = {f"{name}_noise": s.sigma[c] for c, name in (("theta", "angle"), ("i_a", "current"), ("v_a", "voltage"))
              if s.has(c)}
     measured = {**model.sensing, **noise, **{n.replace("_noise", "_lsb"): 0.0 for n in noise}}
-    return planned(Model(model.name, model.model, measured, model.effects), s.duty, there if channels is None else channels)
+    same = Model(model.name, model.model, measured, model.effects)
+    return planned(same, s.duty, there if channels is None else channels)

@@ -6,6 +6,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
 
 from aeropend_ident.diagnosis.isolation import chance
 from aeropend_ident.diagnosis.isolation.judge import Judge, Truth
@@ -13,8 +15,14 @@ from aeropend_ident.diagnosis.isolation.judge import Judge, Truth
 LARGEST = 10.0
 """Largest size that is tried, in usual sizes (choice: a rig that is so far from its model is no rig any more)."""
 
+LEAST = 1e-3
+"""Smallest size that is told from none, in usual sizes (choice: a delay of any size shows where a step is sampled)."""
+
 FIRST = 0.05
 """First size that is tried, in usual sizes (choice: about where effects of `bench` begin to show)."""
+
+ROUGHLY = 0.4
+"""Margin below which all rigs are looked at (choice: they differ by less)."""
 
 NEAR = 0.02
 """Relative change of a size below which a search for it ends (choice: far below the scatter of noise)."""
@@ -24,6 +32,13 @@ FACTOR = 1.25
 
 MOST_STEPS = 20
 """Steps of a search at most (choice: it needs four to six)."""
+
+
+class Margin(Protocol):
+    """A margin of a size: about the log of the size over that wanted."""
+
+    def __call__(self, size: float, *, roughly: bool = False) -> float:
+        """The margin; `roughly`: a cheaper one."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +73,8 @@ def smallest(judge: Judge, truth: Truth, *, name: bool = True) -> Smallest:
     if not truth.stages:
         return Smallest(None, None, {})
     largest = min(LARGEST * abs(truth.usual), truth.largest)
-    shown = _crossing(lambda size: judge.margin(truth, size), FIRST * abs(truth.usual), largest)
+    shown = _crossing(partial(judge.margin, truth), FIRST * abs(truth.usual), largest)
+    shown = None if shown is None else max(shown, LEAST * abs(truth.usual))
     seen = None if shown is None else _first(lambda size: judge.is_sure(truth, size), shown, largest)
     if seen is None or not name:
         return Smallest(seen, None, {})
@@ -67,11 +83,13 @@ def smallest(judge: Judge, truth: Truth, *, name: bool = True) -> Smallest:
     return Smallest(seen, named, judge.probabilities(truth, seen) if rivals is None else rivals)
 
 
-def _crossing(margin: Callable[[float], float], first: float, largest: float) -> float | None:
-    """The size at which a margin, about the log of the size over that wanted, becomes 0; None above the largest."""
+def _crossing(margin: Margin, first: float, largest: float) -> float | None:
+    """The size at which a margin becomes 0; None above the largest."""
     size, low, high = min(first, largest), 0.0, math.inf
     for _ in range(MOST_STEPS):
-        m = margin(size)
+        m = margin(size, roughly=True)
+        if abs(m) < ROUGHLY:
+            m = margin(size)
         if abs(m) < NEAR:
             return size
         low, high = (size, high) if m < 0.0 else (low, size)

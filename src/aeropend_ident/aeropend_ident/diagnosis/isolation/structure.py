@@ -6,7 +6,8 @@ equation is in the overdetermined part of the equations, where a variable can be
 redundancy). It is isolable from another if it is so without the other's equation.
 
 Sources: A. Dulmage, N. Mendelsohn: Coverings of bipartite graphs. Canadian Journal of Mathematics 10, 1958.
-M. Krysander, E. Frisk: Sensor placement for fault diagnosis. IEEE Transactions on Systems, Man, and Cybernetics 38, 2008.
+M. Krysander, E. Frisk: Sensor placement for fault diagnosis. IEEE Transactions on Systems, Man, and Cybernetics A 38,
+2008.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ MODEL: Equations = MappingProxyType({
     "d angle/dt": frozenset({"rate", "angle"}),
     "d rate/dt": frozenset({"d_rate", "rate"}),
 })
-"""The equations of the chain (`dynamics`, `actuator`), one a place, and the derivatives; a current pulls the supply down."""
+"""The equations of the chain (`dynamics`, `actuator`), one a place, and the derivatives; current loads the supply."""
 
 READS = {"theta": "angle", "omega": "speed", "i_a": "current", "v_a": "voltage"}
 """The variable that each channel reads."""
@@ -93,5 +94,5 @@ def isolable(of: Equations, wrong: Mapping[str, str]) -> dict[str, frozenset[str
     whole = overdetermined(of)
     without = {e: overdetermined({k: v for k, v in of.items() if k != e}) for e in set(wrong.values()) if e in of}
     return {f: frozenset([""] * (e in whole) + [g for g, other in wrong.items()
-                                               if e in (without[other] if other in without else whole) and e != other])
+                                               if e in without.get(other, whole) and e != other])
             for f, e in wrong.items()}

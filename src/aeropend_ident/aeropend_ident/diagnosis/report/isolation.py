@@ -66,7 +66,8 @@ def render(found: Isolation, command: str) -> str:
         One HTML file that needs nothing else.
     """
     environment = Environment(loader=PackageLoader("aeropend_ident", "diagnosis/report/templates"), autoescape=True,
-                              trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, undefined=StrictUndefined)
+                              trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
+                              undefined=StrictUndefined)
     environment.filters.update(quantity=quantity, percent=percent, probability=probability)
     rows = matrix(found)
     names = [a.effect for a in found.at_size]
