@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -34,11 +34,14 @@ from aeropend_sim.model.effects import DEFINED, RANDOM
 
 Array = NDArray[np.float64]
 
-SIZES = (0.1, 1.0, 3.0)
+SIZES = (0.1, 1.0, 3.0, 10.0)
 """Sizes of a rival, in usual sizes, besides that from which a search starts, at which it is linearised (choice)."""
 
 RIVALS = 4
 """Rivals that are fitted after the screening (choice: as many as contend in a diagnosis)."""
+
+STEPS, SETTLED = 6, 0.003
+"""Times that a rival is linearised again at most, and relative change of its size that needs no further (choice)."""
 
 MIRRORS = (1.0, -1.0)
 """The noise, and its mirror image."""
@@ -90,18 +93,20 @@ class Truth:
 
 @dataclass(frozen=True)
 class Rival:
-    """A hypothesis, linearised at several points: one alternative each.
+    """A hypothesis, linearised at a point.
 
     Attributes:
         hypothesis: what it is.
         stages: whose residuals it changes.
-        alternatives: the columns of each.
+        columns: one, or two between which its second parameter lies.
+        starts: its parameters, of each column; none for a parameter of the model.
         instead: name of the nominal parameter that it fits in its own way.
     """
 
     hypothesis: Hypothesis
     stages: tuple[str, ...]
-    alternatives: tuple[tuple[Column, ...], ...]
+    columns: tuple[Column, ...]
+    starts: tuple[tuple[Parameter, ...], ...] = ()
     instead: str = ""
 
 
@@ -138,12 +143,11 @@ class Judge:
     def rivals(self) -> dict[str, tuple[list[Rival], Screening]]:
         """First stage that they change -> the hypotheses, linearised."""
         shown = [h for h in self.hypotheses if self.acts_on[h.name] and h.effect not in RANDOM]
-        all_ = [self._of_parameter(h) if h.parameter else self._of_effect(h) for h in shown]
-        flat = [Rival(r.hypothesis, r.stages, (own,), r.instead) for r in all_ for own in r.alternatives]
+        all_ = [r for h in shown for r in ([self._of_parameter(h)] if h.parameter else self._of_effect(h))]
         found = {}
         for stage in self.linear.stages:
-            mine = [r for r in flat if r.stages[0] == stage]
-            found[stage] = (mine, Screening(self.linear, [r.alternatives[0] for r in mine]))
+            mine = [r for r in all_ if r.stages[0] == stage]
+            found[stage] = (mine, Screening(self.linear, [r.columns for r in mine]))
         return found
 
     def truth(self, h: Hypothesis) -> Truth:
@@ -158,28 +162,43 @@ class Judge:
         (known,) = (q for q in self.linear.parameters if q.name == p.name)
         wider = p.sd / known.sd
         own = Column({c: wider * x for c, x in column.rows.items()}, p.to_standard(p.low), p.to_standard(p.high))
-        return Rival(h, self.acts_on[h.name], ((own,),), p.name)
+        return Rival(h, self.acts_on[h.name], (own,), instead=p.name)
 
-    def _of_effect(self, h: Hypothesis) -> Rival:
+    def _of_effect(self, h: Hypothesis) -> list[Rival]:
         stages, usual = self.acts_on[h.name], abs(self.truth(h).usual)
-        linear = DEFINED[h.effect].linear_in
-        points = (h.starts[0], h.starts[-1]) if linear else h.starts
-        alternatives: list[tuple[Column, ...]] = []
+        points = (h.starts[0], h.starts[-1]) if DEFINED[h.effect].linear_in else h.starts
+        found: list[Rival] = []
         for share in (None, *SIZES):
-            columns = []
-            for own in points:
-                head = own[0]
-                at = head.begin if share is None else head.mean + math.copysign(share * usual, head.begin - head.mean)
-                at = min(max(at, head.low), head.high)
-                z = head.to_standard(at)
-                change = self.linear.change({**{p.name: p.begin for p in own}, head.name: at}, stages)
-                low, high = (-np.inf, np.inf) if linear == "polar" else (
-                    head.to_standard(head.low), head.to_standard(head.high))
-                if change:
-                    columns.append(Column({c: x / z for c, x in change.items()}, low, high))
-            pairs = list(pairwise(columns))
-            alternatives += pairs or [(c,) for c in columns]
-        return Rival(h, stages, tuple(alternatives))
+            heads = [own[0].begin if share is None else own[0].mean + math.copysign(
+                share * usual, own[0].begin - own[0].mean) for own in points]
+            columns = [(c, own) for own, at in zip(points, heads, strict=True) if (c := self._column(h, own, at)).rows]
+            found += [Rival(h, stages, (a, b), (one, other)) for (a, one), (b, other) in pairwise(columns)]
+            if len(columns) == 1:
+                found.append(Rival(h, stages, (columns[0][0],), (columns[0][1],)))
+        return found
+
+    def _column(self, h: Hypothesis, own: tuple[Parameter, ...], size: float) -> Column:
+        """The column of an effect with a value of its size."""
+        head = own[0]
+        size = min(max(size, head.low), head.high)
+        change = self.linear.change({**{p.name: p.begin for p in own}, head.name: size}, self.acts_on[h.name])
+        free = DEFINED[h.effect].linear_in == "polar"
+        return Column({c: x / head.to_standard(size) for c, x in change.items()},
+                      -np.inf if free else head.to_standard(head.low), np.inf if free else head.to_standard(head.high))
+
+    def _again(self, rival: Rival, r: Residuals) -> Rival:
+        """A rival, linearised at the size with which it fits residuals (Gauss-Newton steps)."""
+        before = math.inf
+        for _ in range(STEPS if rival.starts and not DEFINED[rival.hypothesis.effect].linear_in else 0):
+            f = self.linear.fit(r, rival.columns)
+            z = sum(f.values[f"own{j}"] for j in range(len(rival.columns)))
+            if abs(z - before) <= SETTLED * abs(z):
+                break
+            columns = tuple(self._column(rival.hypothesis, own, own[0].value(z)) for own in rival.starts)
+            if not all(c.rows for c in columns):
+                break
+            rival, before = replace(rival, columns=columns), z
+        return rival
 
     # ---- one effect at one size
 
@@ -251,8 +270,9 @@ class Judge:
         base = [self.linear.fit(r) for r in rs]
         short = self._short(truth, rivals, screening.explained(rs[0], base[0]))
         tried = [(truth.hypothesis, [self.linear.fit(r, self._own(truth, size, change)[0]) for r in rs])]
-        tried += [(one.hypothesis, [self.linear.fit(r, one.alternatives[0], instead=one.instead) for r in rs])
-                  for one in short]
+        for one in short:
+            again = self._again(one, rs[0])
+            tried.append((one.hypothesis, [self.linear.fit(r, again.columns, instead=again.instead) for r in rs]))
         gains = [_mean([_gain(b, f) for b, f in zip(base, fits, strict=True)]) + h.log_odds for h, fits in tried]
         open_, *left = (_mean([squared_gap(self.chains, f, CHANNELS_OF[first]) for f in fits])
                         for fits in (base, *(fits for _, fits in tried)))
