@@ -40,8 +40,14 @@ SIZES = (0.1, 1.0, 3.0, 10.0)
 RIVALS = 4
 """Rivals that are fitted after the screening (choice: as many as contend in a diagnosis)."""
 
+CLOSEST = 3
+"""Rivals that are linearised again where they fit (choice: those that explain less are ruled out in any case)."""
+
 STEPS, SETTLED = 6, 0.003
 """Times that a rival is linearised again at most, and relative change of its size that needs no further (choice)."""
+
+RUNS_AWAY = 1e6
+"""Change of a residual, in units of a reading's noise, of a simulation that diverges (choice: far above any reading)."""
 
 MIRRORS = (1.0, -1.0)
 """The noise, and its mirror image."""
@@ -182,6 +188,8 @@ class Judge:
         head = own[0]
         size = min(max(size, head.low), head.high)
         change = self.linear.change({**{p.name: p.begin for p in own}, head.name: size}, self.acts_on[h.name])
+        if any(np.abs(x).max() > RUNS_AWAY for x in change.values()):
+            change = {}
         free = DEFINED[h.effect].linear_in == "polar"
         return Column({c: x / head.to_standard(size) for c, x in change.items()},
                       -np.inf if free else head.to_standard(head.low), np.inf if free else head.to_standard(head.high))
@@ -192,7 +200,7 @@ class Judge:
         for _ in range(STEPS if rival.starts and not DEFINED[rival.hypothesis.effect].linear_in else 0):
             f = self.linear.fit(r, rival.columns)
             z = sum(f.values[f"own{j}"] for j in range(len(rival.columns)))
-            if abs(z - before) <= SETTLED * abs(z):
+            if abs(z - before) <= SETTLED * abs(z) or abs(z) < LEAST:
                 break
             columns = tuple(self._column(rival.hypothesis, own, own[0].value(z)) for own in rival.starts)
             if not all(c.rows for c in columns):
@@ -270,8 +278,8 @@ class Judge:
         base = [self.linear.fit(r) for r in rs]
         short = self._short(truth, rivals, screening.explained(rs[0], base[0]))
         tried = [(truth.hypothesis, [self.linear.fit(r, self._own(truth, size, change)[0]) for r in rs])]
-        for one in short:
-            again = self._again(one, rs[0])
+        for k, one in enumerate(short):
+            again = self._again(one, rs[0]) if k < CLOSEST else one
             tried.append((one.hypothesis, [self.linear.fit(r, again.columns, instead=again.instead) for r in rs]))
         gains = [_mean([_gain(b, f) for b, f in zip(base, fits, strict=True)]) + h.log_odds for h, fits in tried]
         open_, *left = (_mean([squared_gap(self.chains, f, CHANNELS_OF[first]) for f in fits])

@@ -95,7 +95,7 @@ class LinearStages:
 
     def change(self, values: Mapping[str, float], stages: Sequence[str]) -> Residuals:
         """Channel -> (N,) change of the residuals by some values, in some stages; unchanged channels are left out."""
-        out = {}
+        out: Residuals = {}
         for stage in stages:
             own = {p.name: p.mean for p in nominal_parameters(self.chains, stage)}
             before = {c: x for c, x in self.noise.items() if self.stage_of[c] == stage}
