@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The structural analysis of `isolate` beside that of faultdiagnosistoolbox (E. Frisk, M. Krysander), if it is installed.
+"""The structural analysis of `isolate` beside that of faultdiagnosistoolbox (E. Frisk, M. Krysander).
 
-    pip install faultdiagnosistoolbox && python -m evaluation.isolate.peer
+`pip install faultdiagnosistoolbox`, then `python -m evaluation.isolate.peer`.
 """
 
 from __future__ import annotations

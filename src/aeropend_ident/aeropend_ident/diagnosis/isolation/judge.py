@@ -47,7 +47,7 @@ STEPS, SETTLED = 6, 0.003
 """Times that a rival is linearised again at most, and relative change of its size that needs no further (choice)."""
 
 RUNS_AWAY = 1e6
-"""Change of a residual, in units of a reading's noise, of a simulation that diverges (choice: far above any reading)."""
+"""Change of a residual, in units of a reading's noise, of a run that diverges (choice: far above any reading)."""
 
 MIRRORS = (1.0, -1.0)
 """The noise, and its mirror image."""
