@@ -21,7 +21,10 @@ from aeropend_ident.estimation.map_fit import bands
 Array = NDArray[np.float64]
 
 STEPS = 8
-"""Steps in which the noise of the bands is renewed (choice: the log evidence then changes by less than 0.1)."""
+"""Steps in which the noise of the bands is renewed at most (choice: more count only for sets that explain little)."""
+
+SETTLED = 0.02
+"""[nats] Change of the log likelihood between steps at which they end (choice: far less than decides)."""
 
 
 class Solution(NamedTuple):
@@ -75,12 +78,19 @@ class LinearSets:
             power = rest + 2.0 * cross @ step + np.einsum("bij,i,j->b", inner, step, step)
             return np.maximum(power, 0.0) / self.count
 
+        def log_likelihood(power: Array) -> float:
+            return -0.5 * float(np.sum(self.count * (np.log(np.maximum(power, 1.0)) + np.minimum(power, 1.0))))
+
         step = np.zeros(len(at))
-        for _ in range(STEPS):
-            weight = 1.0 / np.maximum(noise(step), 1.0)
-            step = np.linalg.solve(np.tensordot(weight, inner, 1) + prior, prior @ mean - weight @ cross)
         power = noise(step)
-        likelihood = -0.5 * float(np.sum(self.count * (np.log(np.maximum(power, 1.0)) + np.minimum(power, 1.0))))
+        likelihood = log_likelihood(power)
+        for _ in range(STEPS):
+            weight = 1.0 / np.maximum(power, 1.0)
+            step = np.linalg.solve(np.tensordot(weight, inner, 1) + prior, prior @ mean - weight @ cross)
+            power, before = noise(step), likelihood
+            likelihood = log_likelihood(power)
+            if abs(likelihood - before) < SETTLED:
+                break
         information, off = np.tensordot(self.weight, inner, 1) + prior, step - mean
         occam = 0.5 * float(np.linalg.slogdet(prior)[1] - off @ prior @ off - np.linalg.slogdet(information)[1])
         return Solution(step, likelihood + occam)

@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
-from aeropend_ident.diagnosis.chain.values import neutral
+from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, neutral
 from aeropend_ident.diagnosis.policy import CALIBRATED
 from aeropend_ident.diagnosis.search.findings import Findings, LikelySet, RankedHypothesis, Selection, adopted
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, from_linear, linear_parameters
-from aeropend_ident.diagnosis.search.selection import CONTENDERS, ROUNDS
+from aeropend_ident.diagnosis.search.selection import ALIKE, CONTENDERS, ROUNDS, squared_gap
 from aeropend_ident.estimation.linear_sets import LinearSets
 from aeropend_ident.estimation.map_fit import Fit, finite, fit, largest_ess, prior_information, sensitivities
 from aeropend_ident.estimation.parameter import Parameter, started
@@ -275,8 +275,8 @@ def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Param
                   candidates: Sequence[Hypothesis], *, contenders: bool = True) -> Findings:
     """The findings of a stage with the set of effects that has most log evidence.
 
-    The search starts from what was found, and from each contender of the first round alone: a lag of the thrust and one
-    of the reading, say, are far from linear, and no small step leads from one to the other.
+    The search starts from what was found, and from each contender of the first round alone that closes about as much: a
+    lag of the thrust and one of the reading, say, are far from linear, and no small step leads from one to the other.
 
     Args:
         chains: the cut chains.
@@ -286,9 +286,11 @@ def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Param
         contenders: whether to start from each contender of the first round too.
     """
     found = {h.name for h in findings.effects}
-    alone = [r for r in findings.selections[0][:CONTENDERS] if {r.hypothesis.name} != found
-             and r.fit.residuals.keys() == findings.base.residuals.keys()
+    alone = [r for r in findings.selections[0][:CONTENDERS] if r.fit.residuals.keys() == findings.base.residuals.keys()
              and r.fit.values.keys() == {p.name for p in adopted(list(nominal), r.hypothesis)}]
+    left = [squared_gap(chains, r.fit, CHANNELS_OF[findings.stage]) for r in alone]
+    alone = [r for r, x in zip(alone, left, strict=True)
+             if {r.hypothesis.name} != found and x <= ALIKE * min(left)]
     seen: set[frozenset[str]] = set()
     best = findings
     starts = [replace(findings, found=((r,),), final=r.fit) for r in alone] if contenders else []
