@@ -28,7 +28,14 @@ from aeropend_ident.diagnosis.chain.hanging import mounted
 from aeropend_ident.diagnosis.chain.known import Known
 from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model
 from aeropend_ident.diagnosis.chain.pwm_timing import with_pwm_timing
-from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, PLACE_OF_PARAMETER, neutral, of_rig, with_values
+from aeropend_ident.diagnosis.chain.values import (
+    CHANNELS_OF,
+    PLACE_OF_PARAMETER,
+    neutral,
+    of_rig,
+    own_sensing,
+    with_values,
+)
 from aeropend_ident.diagnosis.conclude import Statistical
 from aeropend_ident.diagnosis.document import (
     CANNOT_TELL,
@@ -272,7 +279,7 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     model, chains = found.chains.model, found.chains
     nominal = model if chains.policy.calibrated else with_values(model, of_rig(gaps.base))
     progress("done", 1.0)
-    measured = model if chains.policy.calibrated else replace(model, sensing=_own_sensing(model, found.recordings))
+    measured = model if chains.policy.calibrated else replace(model, sensing=own_sensing(model, found.recordings))
     return Diagnosis(nominal, _augmented(measured, joint.values_of_rig, found.statistical), found.recordings,
                      gaps.runs_before, gaps.runs_after, conclusions, found.misfit)
 
@@ -598,16 +605,6 @@ def _left(findings: Mapping[str, Findings], *, gust: bool) -> dict[str, float]:
                 name = key(channel).name
                 left[name] = max(left.get(name, 0.0), rms(r))
     return left
-
-
-def _own_sensing(model: Model, recordings: Sequence[Signals]) -> dict[str, float]:
-    """The measurement chain of a model with the noise that the recordings show; it holds their resolution."""
-    own = dict(model.sensing)
-    for channel, name in (("theta", "angle"), ("i_a", "current"), ("v_a", "voltage")):
-        seen = [s.sigma[channel] for s in recordings if s.has(channel)]
-        if seen:
-            own |= {f"{name}_noise": float(np.mean(seen)), f"{name}_lsb": 0.0}
-    return own
 
 
 def _augmented(model: Model, values: Mapping[str, float], statistical: Statistical) -> Model:

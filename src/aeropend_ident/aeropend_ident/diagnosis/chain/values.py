@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from aeropend_ident.estimation.parameter import key
+from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model.effects import DEFINED, EffectParameter
 from aeropend_sim.model.parameters import DUTY_MAP, OPTIONAL, PARAMETERS, Model
 from aeropend_sim.model.parameters import Parameter as ModelParameter
@@ -90,6 +91,16 @@ def clipped(name: str, value: float) -> float:
     """A value within the range of its parameter."""
     p = limits(name)
     return min(max(value, p.low), p.high)
+
+
+def own_sensing(model: Model, recordings: Sequence[Signals]) -> dict[str, float]:
+    """The measurement chain of a model with the noise that the recordings show; it holds their resolution."""
+    own = dict(model.sensing)
+    for channel, name in (("theta", "angle"), ("i_a", "current"), ("v_a", "voltage")):
+        seen = [s.sigma[channel] for s in recordings if s.has(channel)]
+        if seen:
+            own |= {f"{name}_noise": float(np.mean(seen)), f"{name}_lsb": 0.0}
+    return own
 
 
 def of_rig(values: Values) -> dict[str, float]:

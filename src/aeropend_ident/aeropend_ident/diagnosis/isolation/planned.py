@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from aeropend_ident.diagnosis.chain.values import own_sensing
 from aeropend_ident.signals.signals import CHANNELS, Signals, from_arrays
 from aeropend_sim.errors import UserError
 from aeropend_sim.model import rig
@@ -58,8 +60,5 @@ def like(model: Model, s: Signals, channels: Collection[str] | None = None) -> S
     there = [c for c in CHANNELS if s.has(c)]
     if channels is not None and (missing := [c for c in channels if c not in there]):
         raise PlanError(f"the recording has no {missing[0]}: it has {', '.join(there)}")
-    noise = {f"{name}_noise": s.sigma[c] for c, name in (("theta", "angle"), ("i_a", "current"), ("v_a", "voltage"))
-             if s.has(c)}
-    measured = {**model.sensing, **noise, **{n.replace("_noise", "_lsb"): 0.0 for n in noise}}
-    same = Model(model.name, model.model, measured, model.effects)
+    same = replace(model, sensing=own_sensing(model, [s]))
     return planned(same, s.duty, there if channels is None else channels)

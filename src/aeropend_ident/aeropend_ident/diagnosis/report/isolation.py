@@ -5,10 +5,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from aeropend_ident.diagnosis.isolation.isolate import Isolation
-from aeropend_ident.diagnosis.report.number_format import percent, probability, quantity
+from aeropend_ident.diagnosis.report.environment import environment
 
 
 @dataclass(frozen=True)
@@ -33,12 +31,10 @@ def matrix(found: Isolation) -> list[tuple[str, list[Cell]]]:
     Args:
         found: what a planned recording would show.
     """
-    effects = [a.effect for a in found.at_size]
-    others = sorted({r for a in found.at_size for r in a.rivals} - set(effects))
     rows = []
     for a in found.at_size:
         cells = []
-        for rival in (*effects, *others):
+        for rival in _named(found):
             p = a.rivals.get(rival, 0.0)
             if rival == a.effect:
                 cells.append(Cell("self", f"{a.effect} itself"))
@@ -65,11 +61,11 @@ def render(found: Isolation, command: str) -> str:
     Returns:
         One HTML file that needs nothing else.
     """
-    environment = Environment(loader=PackageLoader("aeropend_ident", "diagnosis/report/templates"), autoescape=True,
-                              trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
-                              undefined=StrictUndefined)
-    environment.filters.update(quantity=quantity, percent=percent, probability=probability)
-    rows = matrix(found)
-    names = [a.effect for a in found.at_size]
-    names += sorted({r for a in found.at_size for r in a.rivals} - set(names))
-    return environment.get_template("isolation.html.j2").render(found=found, rows=rows, names=names, command=command)
+    return environment().get_template("isolation.html.j2").render(found=found, rows=matrix(found), names=_named(found),
+                                                                  command=command)
+
+
+def _named(found: Isolation) -> list[str]:
+    """The effects that might be named: the columns of the matrix."""
+    effects = [a.effect for a in found.at_size]
+    return effects + sorted({r for a in found.at_size for r in a.rivals} - set(effects))

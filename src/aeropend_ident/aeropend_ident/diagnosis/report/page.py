@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from importlib import metadata
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from aeropend_ident.diagnosis.diagnosis import Diagnosis
 from aeropend_ident.diagnosis.document import DiagnosisDocument
 from aeropend_ident.diagnosis.report import (
@@ -26,7 +24,7 @@ from aeropend_ident.diagnosis.report import (
     verdict,
 )
 from aeropend_ident.diagnosis.report.drawing import HEIGHT, WIDTH
-from aeropend_ident.diagnosis.report.number_format import percent, probability, quantity
+from aeropend_ident.diagnosis.report.environment import environment
 from aeropend_ident.signals.signals import Signals
 
 
@@ -83,14 +81,10 @@ def render(diagnosis: Diagnosis, document: DiagnosisDocument, command: str) -> s
     Returns:
         One HTML file that needs nothing else, neither network nor fonts.
     """
-    loader = PackageLoader("aeropend_ident", "diagnosis/report/templates")
-    environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True,
-                              keep_trailing_newline=True, undefined=StrictUndefined)
-    environment.filters.update(quantity=quantity, percent=percent, probability=probability)
     rows, table = candidates.rows(document), parameters.section(document)
     origin = Origin(command, document.bags, *_nominal(document), document.seconds, _versions(),
                     datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %z"))
-    return environment.get_template("page.html.j2").render(
+    return environment().get_template("page.html.j2").render(
         width=WIDTH, height=HEIGHT, origin=origin, verdict=verdict.section(document, rows),
         care=care.reasons(document, diagnosis.signals, rows, table.rows), gap=gap.section(document),
         location=location.section(document, diagnosis.misfit, rows), unknown=curves.section(diagnosis, document),
