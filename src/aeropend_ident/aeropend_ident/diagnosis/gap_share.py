@@ -102,14 +102,15 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
         held_out: measures gaps.
         jobs: threads.
     """
-    after = held_out.gap_of(joint.values)
-
     stages = [f.effects for f in joint.findings.values() if f.effects]
+    if not stages:
+        return []
+    after = held_out.gap_of(joint.values)
     every = [h for effects in stages for h in effects]
     subsets = {_names(gone): gone for effects in stages for h in effects
                for gone in ([h], _but(effects, h), effects, _but(every, h), every) if gone}
-    for effects in stages:  # the others start from these
-        joint.without(effects)
+    for gone in (*stages, every):  # the others start from these
+        joint.without(gone)
     with ThreadPoolExecutor(jobs) as pool:
         found = pool.map(lambda gone: held_out.gap_of(joint.without(gone)), subsets.values())
         gaps = {frozenset(): after, **dict(zip(subsets, found, strict=True))}

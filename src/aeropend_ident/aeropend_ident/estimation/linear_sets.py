@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct
 
-from aeropend_ident.estimation.map_fit import bands
+from aeropend_ident.estimation.map_fit import band_log_likelihood, bands
 
 Array = NDArray[np.float64]
 
@@ -78,17 +78,14 @@ class LinearSets:
             power = rest + 2.0 * cross @ step + np.einsum("bij,i,j->b", inner, step, step)
             return np.maximum(power, 0.0) / self.count
 
-        def log_likelihood(power: Array) -> float:
-            return -0.5 * float(np.sum(self.count * (np.log(np.maximum(power, 1.0)) + np.minimum(power, 1.0))))
-
         step = np.zeros(len(at))
         power = noise(step)
-        likelihood = log_likelihood(power)
+        likelihood = band_log_likelihood(power, self.count)
         for _ in range(STEPS):
             weight = 1.0 / np.maximum(power, 1.0)
             step = np.linalg.solve(np.tensordot(weight, inner, 1) + prior, prior @ mean - weight @ cross)
             power, before = noise(step), likelihood
-            likelihood = log_likelihood(power)
+            likelihood = band_log_likelihood(power, self.count)
             if abs(likelihood - before) < SETTLED:
                 break
         information, off = np.tensordot(self.weight, inner, 1) + prior, step - mean

@@ -122,6 +122,11 @@ class Fit:
         """
         return self.log_likelihood + self.log_occam(ess)
 
+    def evidence_over(self, other: Fit) -> float:
+        """Log evidence over that of another fit, each channel with the larger effective sample size of the two."""
+        ess = largest_ess([self, other])
+        return self.log_evidence(ess) - other.log_evidence(ess)
+
     @cached_property
     def log_likelihood(self) -> float:
         """Log likelihood with noise that has a spectrum; see `whittle`."""
@@ -168,6 +173,16 @@ def whittle(r: Array) -> float:
     edges = bands(len(r))
     count = np.diff(edges)
     power = np.add.reduceat(dct(r, norm="ortho") ** 2, edges[:-1]) / count
+    return band_log_likelihood(power, count)
+
+
+def band_log_likelihood(power: Array, count: Array | NDArray[np.intp]) -> float:
+    """Log likelihood of a residual by its bands, the noise of each that of the residual, but at least a reading's.
+
+    Args:
+        power: (B,) mean square of the residual in each band, in units of a reading's noise.
+        count: (B,) coefficients in each band.
+    """
     noise = np.maximum(power, 1.0)
     return float(-0.5 * np.sum(count * (np.log(noise) + power / noise)))
 
@@ -236,10 +251,7 @@ class Search:
 
     def renew_weights(self) -> None:
         """Set noise inflation and effective sample size to those of the residuals at this point."""
-        self.scale = {k: max(1.0, float(np.sqrt(np.mean(r * r)))) for k, r in self.current.items()}
-        self.ess = {k: effective_sample_size(r) for k, r in self.current.items()}
-        self.weight = {k: np.sqrt(min(max(self.ess[k], self.least_ess) / len(r), 1.0)) / self.scale[k]
-                       for k, r in self.current.items()}
+        self.weight, self.scale, self.ess = weights(self.current, self.least_ess)
 
     def stack(self, residuals: Residuals) -> Array:
         """Weighted residuals of all channels as one vector."""
@@ -353,6 +365,19 @@ class Search:
             if ended or gained < GOOD_STEP * expected:
                 self.slopes = {}
         return information, products
+
+
+def weights(residuals: Residuals, least_ess: float = 0.0
+            ) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
+    """Weight of each channel in the cost, its noise inflation, and its effective sample size.
+
+    Args:
+        residuals: channel -> (N,) in units of a reading's noise.
+        least_ess: effective sample size that a channel counts for at least.
+    """
+    scale = {k: max(1.0, float(np.sqrt(np.mean(r * r)))) for k, r in residuals.items()}
+    ess = {k: effective_sample_size(r) for k, r in residuals.items()}
+    return {k: np.sqrt(min(max(ess[k], least_ess) / len(r), 1.0)) / scale[k] for k, r in residuals.items()}, scale, ess
 
 
 def prior_information(parameters: Sequence[Parameter]) -> Array:

@@ -32,7 +32,7 @@ from aeropend_ident.diagnosis.chain.values import FILTER, absent_at, of_rig, wit
 from aeropend_ident.diagnosis.chain.weak_start import WeakForm, downsampled, likeliest
 from aeropend_ident.diagnosis.document import Lift
 from aeropend_ident.diagnosis.policy import UNCALIBRATED
-from aeropend_ident.estimation.map_fit import ENOUGH, Fit, Search, Sensitivities, fit, largest_ess, passed
+from aeropend_ident.estimation.map_fit import ENOUGH, Fit, Search, Sensitivities, fit, passed
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import actuator, dynamics
@@ -324,8 +324,7 @@ def _delay_or_lag(best: Candidate, recordings: Sequence[Signals], keep: Collecti
     effects = {e: p for e, p in best.model.effects.items() if e not in here}
     as_long = {LAGS[other]: best.model.effect(here[0], LAGS[here[0]])}
     f = fit_own(best.model.with_effects({**effects, other: as_long}), recordings, ROUNDS, STEPS)
-    ess = largest_ess([f, best.fit])
-    if expit(f.log_evidence(ess) - best.fit.log_evidence(ess)) < UNCALIBRATED.undecided:
+    if expit(f.evidence_over(best.fit)) < UNCALIBRATED.undecided:
         return ()
     said = (f"the recordings do not tell {here[0]}, which the identified model holds, from {other}: in its place that "
             "explains the angle about as well; steps of the command tell them apart best")

@@ -28,7 +28,7 @@ from aeropend_ident.diagnosis.joint_fit import SURE, WIDER
 from aeropend_ident.diagnosis.policy import CALIBRATED, CERTAIN, MATERIAL, MATERIAL_SHARE
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, stages_of
 from aeropend_ident.diagnosis.search.selection import squared_gap
-from aeropend_ident.estimation.map_fit import Fit, largest_ess
+from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter
 from aeropend_sim.model.effects import DEFINED, RANDOM
 
@@ -241,7 +241,7 @@ class Judge:
         rs = self._residuals(change := self.linear.change(values, truth.stages), truth.stages)
         own, z = self._own(truth, size, change)
         base, fitted = [self.linear.fit(r) for r in rs], [self.linear.fit(r, own) for r in rs]
-        gain = _mean([_gain(f, g) for f, g in zip(base, fitted, strict=True)]) + truth.hypothesis.log_odds
+        gain = _mean([g.evidence_over(f) for f, g in zip(base, fitted, strict=True)]) + truth.hypothesis.log_odds
         unsure = WIDER * fitted[0].sd["own0"] / z
         if gain <= 0.0 or (gain <= CERTAIN and unsure * SURE > 1.0):
             return False
@@ -281,7 +281,7 @@ class Judge:
         for k, one in enumerate(short):
             again = self._again(one, rs[0]) if k < CLOSEST else one
             tried.append((one.hypothesis, [self.linear.fit(r, again.columns, instead=again.instead) for r in rs]))
-        gains = [_mean([_gain(b, f) for b, f in zip(base, fits, strict=True)]) + h.log_odds for h, fits in tried]
+        gains = [_mean([f.evidence_over(b) for b, f in zip(base, fits, strict=True)]) + h.log_odds for h, fits in tried]
         open_, *left = (_mean([squared_gap(self.chains, f, CHANNELS_OF[first]) for f in fits])
                         for fits in (base, *(fits for _, fits in tried)))
         most = min(left) + MATERIAL_SHARE * open_
@@ -312,12 +312,6 @@ class Judge:
         if max(found, key=lambda n: found[n], default="") != own:
             return None
         return {name: p for name, p in found.items() if name != own and p > CALIBRATED.undecided}
-
-
-def _gain(base: Fit, f: Fit) -> float:
-    """Log evidence of a fit over that without its hypothesis."""
-    ess = largest_ess([base, f])
-    return f.log_evidence(ess) - base.log_evidence(ess)
 
 
 def _squares(f: Fit) -> dict[str, float]:

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.chain.values import STAGES
-from aeropend_ident.estimation.map_fit import WEIGHT_CHANGE, Fit, covariance_of, sensitivities
+from aeropend_ident.estimation.map_fit import WEIGHT_CHANGE, Fit, covariance_of, sensitivities, weights
 from aeropend_ident.estimation.parameter import Parameter, key
-from aeropend_ident.signals.statistics import effective_sample_size
 
 Array = NDArray[np.float64]
 Residuals = dict[str, Array]
@@ -149,7 +148,7 @@ class LinearStages:
             slopes[c] = Products(by, rows, products)
         pulls = {c: rows @ r[c] for c, (_, rows, _) in slopes.items()}
         z, left = np.zeros(size + more), dict(r)
-        weight, scale, ess = _weights(left)
+        weight, scale, ess = weights(left)
         information = np.eye(size + more)
         for _ in range(ROUNDS):
             information, gradient = np.eye(size + more), np.zeros(size + more)
@@ -159,7 +158,7 @@ class LinearStages:
             z = bounded(information, -gradient, low, high)
             left = {c: r[c] + z[by] @ rows for c, (by, rows, _) in slopes.items()}
             before = weight
-            weight, scale, ess = _weights(left)
+            weight, scale, ess = weights(left)
             if all(abs(weight[c] - before[c]) < WEIGHT_CHANGE * before[c] for c in weight):
                 break
         names = [*(p.name for p in self.parameters), *(f"own{j}" for j in range(more))]
@@ -232,13 +231,6 @@ class Screening:
         inside = (i != j) & (determinant > 0.0) & (a >= self.low[i]) & (b >= self.low[j]) & (a <= self.high[i]) & (
             b <= self.high[j])
         return np.where(inside, np.maximum(both, best), best)
-
-
-def _weights(r: Mapping[str, Array]) -> tuple[dict[str, float], dict[str, float], dict[str, float]]:
-    """Weight, noise inflation and effective sample size of each channel, as in `map_fit.Search`."""
-    scale = {c: max(1.0, float(np.sqrt(np.mean(x * x)))) for c, x in r.items()}
-    ess = {c: effective_sample_size(x) for c, x in r.items()}
-    return {c: np.sqrt(min(ess[c] / len(x), 1.0)) / scale[c] for c, x in r.items()}, scale, ess
 
 
 def bounded(information: Array, gradient: Array, low: Array, high: Array) -> Array:

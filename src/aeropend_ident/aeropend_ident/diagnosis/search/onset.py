@@ -25,7 +25,7 @@ from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import EFFECT_ODDS, Hypothesis, hypotheses, stages_of
 from aeropend_ident.diagnosis.search.search import passes_as_noise
 from aeropend_ident.diagnosis.search.selection import CLOSE_GAIN, FORM_SHOWS, squared_gap
-from aeropend_ident.estimation.map_fit import Fit, Search, fit, largest_ess
+from aeropend_ident.estimation.map_fit import Fit, Search, fit
 from aeropend_ident.estimation.parameter import Parameter, key, started
 
 Array = NDArray[np.float64]
@@ -186,11 +186,7 @@ def is_better(once: Mapping[str, Findings], again: Mapping[str, Findings], chain
 
 def gained(once: Mapping[str, Findings], again: Mapping[str, Findings]) -> float:
     """Log evidence that another search of the same recording has more."""
-    gain = 0.0
-    for stage, f in again.items():
-        ess = largest_ess([f.final, once[stage].final])
-        gain += f.final.log_evidence(ess) - once[stage].final.log_evidence(ess)
-    return gain
+    return sum(f.final.evidence_over(once[stage].final) for stage, f in again.items())
 
 
 def located(chains: CutChains, findings: Mapping[str, Findings]) -> Onset:

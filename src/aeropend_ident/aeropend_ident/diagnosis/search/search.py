@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 from scipy.special import expit
@@ -226,8 +227,7 @@ def _select(here: SelectionRound, findings: Findings, candidates: list[Hypothesi
     # the parameters that the best hypothesis was led to may serve as well without it
     again = fit(chains.residuals(here.stage), started(here.known, ranked[0].fit.values),
                 least_ess=chains.policy.least_ess, deadline=here.deadline)
-    ess = largest_ess([here.current, again])
-    if again.log_evidence(ess) > here.current.log_evidence(ess) + BETTER_ALONE:
+    if again.evidence_over(here.current) > BETTER_ALONE:
         findings = replace(findings, final=again, base=findings.base if findings.found else again)
         here = replace(here, current=again)
         ranked = here.ranked(tried)
@@ -252,11 +252,7 @@ def _select(here: SelectionRound, findings: Findings, candidates: list[Hypothesi
 
 def _beside(findings: Findings, nominal: list[Parameter], hypothesis: Hypothesis) -> list[Parameter]:
     """The parameters of all effects found but one."""
-    known = nominal
-    for h in findings.effects:
-        if h is not hypothesis:
-            known = adopted(known, h)
-    return known
+    return reduce(adopted, [h for h in findings.effects if h is not hypothesis], nominal)
 
 
 def _with_better_rivals(chains: CutChains, findings: Findings, nominal: list[Parameter]) -> Findings:
@@ -286,8 +282,7 @@ def _swapped(chains: CutChains, findings: Findings, nominal: list[Parameter], k:
     old = selection[0].hypothesis
     begun = {**findings.final.values, **{p.name: rival.fit.values[p.name] for p in new.own}}
     f = fit(chains.residuals(findings.stage), started(adopted(_beside(findings, nominal, old), new), begun))
-    ess = largest_ess([findings.final, f])
-    gain = f.log_evidence(ess) - findings.final.log_evidence(ess) + new.log_odds - old.log_odds
+    gain = f.evidence_over(findings.final) + new.log_odds - old.log_odds
     if gain <= 0.0 or (len(new.own) > len(old.own) and _alike(chains, findings, f)):
         return None
     sure = float(expit(gain))
@@ -345,8 +340,7 @@ def _without_unneeded(chains: CutChains, findings: Findings, nominal: list[Param
         closes = squared_gap(chains, f, CHANNELS_OF[now.stage]) - squared_gap(chains, now.final, CHANNELS_OF[now.stage])
         if closes <= trifle and not at_end_of_prior(chains, now.stage, f):
             return closes - UNNEEDED
-        ess = largest_ess([now.final, f])
-        return now.final.log_evidence(ess) - f.log_evidence(ess)
+        return now.final.evidence_over(f)
 
     return drop_unneeded(findings, without, lost, least=1)
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +24,7 @@ from aeropend_ident.diagnosis.search.findings import Findings, LikelySet, Ranked
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, from_linear, linear_parameters
 from aeropend_ident.diagnosis.search.selection import ALIKE, CONTENDERS, ROUNDS, squared_gap
 from aeropend_ident.estimation.linear_sets import LinearSets
-from aeropend_ident.estimation.map_fit import Fit, finite, fit, largest_ess, prior_information, sensitivities
+from aeropend_ident.estimation.map_fit import Fit, finite, fit, prior_information, sensitivities
 from aeropend_ident.estimation.parameter import Parameter, started
 from aeropend_sim.model.effects import DEFINED
 
@@ -108,7 +109,7 @@ class LinearStage:
 
     def __init__(self, chains: CutChains, findings: Findings, nominal: Sequence[Parameter],
                  candidates: Sequence[Hypothesis]) -> None:
-        self._chains = chains
+        self._chains, self.findings = chains, findings
         self._residuals = chains.residuals(findings.stage)
         values = findings.final.values
         self._now = self._at(values)
@@ -215,6 +216,11 @@ class LinearStage:
         within = {n: min(max(v, ends[n].low), ends[n].high) for n, v in values.items()}
         return Predicted(log_evidence + sum(m.hypothesis.log_odds for m in members), within)
 
+    def fitted(self, members: Set, values: Mapping[str, float], rounds: int = ROUNDS) -> Fit:
+        """The fit of a set; `values`: where it starts."""
+        parameters = reduce(adopted, [m.hypothesis for m in members], [t.parameter for t in self.nominal])
+        return fit(self._residuals, started(parameters, {**self.findings.final.values, **values}), rounds)
+
     def neighbours(self, members: Set) -> Iterator[Set]:
         """The sets with one effect less, one more, or one in place of another."""
         smaller = [tuple(m for m in members if m is not gone) for gone in members]
@@ -292,23 +298,22 @@ def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Param
     alone = [r for r, x in zip(alone, left, strict=True)
              if {r.hypothesis.name} != found and x <= ALIKE * min(left)]
     seen: set[frozenset[str]] = set()
-    best = findings
-    starts = [replace(findings, found=((r,),), final=r.fit) for r in alone] if contenders else []
-    for start in (findings, *starts):
+    best = _climbed(chains, findings, nominal, candidates, seen)
+    for r in alone if contenders else []:
+        start = replace(findings, found=((r,),), final=r.fit)
         there = _climbed(chains, start, nominal, candidates, seen)
-        if _gain(best, there.effects, there.final) > LEAST:
+        if _gain(best.findings, there.findings.effects, there.findings.final) > LEAST:
             best = there
-    if best is findings:
+    if best.findings is findings:
         return findings
-    linear = LinearStage(chains, best, nominal, candidates)
-    return replace(best, rivals=findings.rivals, found=tuple(
-        s if m.hypothesis.name in found else _with_rivals(chains, findings, best, nominal, linear, m, s)
-        for m, s in zip(linear.found, best.found, strict=True)))
+    return replace(best.findings, rivals=findings.rivals, found=tuple(
+        s if m.hypothesis.name in found else _with_rivals(best, m, findings)
+        for m, s in zip(best.found, best.findings.found, strict=True)))
 
 
 def _climbed(chains: CutChains, findings: Findings, nominal: Sequence[Parameter], candidates: Sequence[Hypothesis],
-             seen: set[frozenset[str]]) -> Findings:
-    """The best set that is reached from a start; `seen`: names of the sets that were fitted, which it extends."""
+             seen: set[frozenset[str]]) -> LinearStage:
+    """The stage with the best set that is reached; `seen`: names of the sets that were fitted, which it extends."""
     seen.add(frozenset(h.name for h in findings.effects))
     linear, failed = LinearStage(chains, findings, nominal, candidates), 0
     while failed < TRIES:
@@ -318,29 +323,20 @@ def _climbed(chains: CutChains, findings: Findings, nominal: Sequence[Parameter]
         members, there = best
         seen.add(names(members))
         effects = [m.hypothesis for m in members]
-        f = _fitted(chains, findings, nominal, members, there.values, FIRST_ROUNDS)
+        f = linear.fitted(members, there.values, FIRST_ROUNDS)
         if _gain(findings, effects, f) > -PROMISING:
-            f = _fitted(chains, findings, nominal, members, f.values)
+            f = linear.fitted(members, f.values)
         if _gain(findings, effects, f) <= LEAST:
             failed += 1
             continue
         findings = replace(findings, final=f, found=tuple(_before(findings, m.hypothesis, f) for m in members))
         linear, failed = LinearStage(chains, findings, nominal, candidates), 0
-    return findings
-
-
-def _fitted(chains: CutChains, findings: Findings, nominal: Sequence[Parameter], members: Set,
-            values: Mapping[str, float], rounds: int = ROUNDS) -> Fit:
-    known = list(nominal)
-    for m in members:
-        known = adopted(known, m.hypothesis)
-    return fit(chains.residuals(findings.stage), started(known, {**findings.final.values, **values}), rounds)
+    return linear
 
 
 def _gain(findings: Findings, effects: Sequence[Hypothesis], f: Fit) -> float:
     """Log evidence of the fit of a set over that of what was found, prior odds included."""
-    ess = largest_ess([findings.final, f])
-    return (f.log_evidence(ess) - findings.final.log_evidence(ess) + sum(h.log_odds for h in effects)
+    return (f.evidence_over(findings.final) + sum(h.log_odds for h in effects)
             - sum(h.log_odds for h in findings.effects))
 
 
@@ -352,42 +348,36 @@ def _before(findings: Findings, h: Hypothesis, f: Fit) -> Selection:
     return (RankedHypothesis(h, f, 0.0, 1.0),)
 
 
-def _with_rivals(chains: CutChains, begun: Findings, findings: Findings, nominal: Sequence[Parameter],
-                 linear: LinearStage, mine: Member, selection: Selection) -> Selection:
+def _with_rivals(linear: LinearStage, mine: Member, begun: Findings) -> Selection:
     """The selection of an effect that only the comparison of sets found: its rivals are those of the best set.
 
     Args:
-        chains: the cut chains.
-        begun: the findings before the comparison.
-        findings: the best set.
-        nominal: parameters of the stage without effects.
-        linear: the linear model around the best set.
+        linear: the stage with the best set.
         mine: the effect.
-        selection: in which it is alone.
+        begun: the findings before the comparison.
     """
     others = tuple(m for m in linear.found if m is not mine)
     here, none = linear.predicted(linear.found).log_evidence, linear.predicted(others).log_evidence
     taken = {m.hypothesis.family for m in linear.found}
-    rivals: dict[str, tuple[float, Member, Predicted]] = {}
+    rivals: dict[str, tuple[Member, Predicted]] = {}
     for m in linear.options:
-        there = linear.predicted((*others, m))
-        if m.hypothesis.family not in taken and there.log_evidence > rivals.get(m.hypothesis.family, (-np.inf,))[0]:
-            rivals[m.hypothesis.family] = there.log_evidence, m, there
-    weight = {family: float(np.exp(min(e - here, 0.0))) for family, (e, *_) in rivals.items()}
+        family, there = m.hypothesis.family, linear.predicted((*others, m))
+        if family not in taken and there.log_evidence > (
+                rivals[family][1].log_evidence if family in rivals else -np.inf):
+            rivals[family] = m, there
+    weight = {family: float(np.exp(min(there.log_evidence - here, 0.0))) for family, (_, there) in rivals.items()}
     total = 1.0 + sum(weight.values()) + float(np.exp(min(none - here, 0.0)))
     ranked = {r.hypothesis.family: r for s in reversed(begun.selections) for r in reversed(s)}
     found = []
-    for family, (e, m, there) in rivals.items():
+    for family, (m, there) in rivals.items():
         p = weight[family] / total
         if p > CALIBRATED.undecided:
-            f = _fitted(chains, findings, nominal, tuple(m if x is mine else x for x in linear.found), there.values,
-                        FIRST_ROUNDS)
-            found.append(RankedHypothesis(m.hypothesis, f, e - none, p))
+            f = linear.fitted(tuple(m if x is mine else x for x in linear.found), there.values, FIRST_ROUNDS)
+            found.append(RankedHypothesis(m.hypothesis, f, there.log_evidence - none, p))
         elif family in ranked:
             found.append(replace(ranked[family], probability=p))
-    first = replace(selection[0], gain=here - none, probability=1.0 / total)
     was = ranked.get(mine.hypothesis.family)
-    if was is not None:
-        forms = [x for x in (was, *was.others) if x.hypothesis.name != mine.hypothesis.name]
-        first = replace(first, others=tuple(replace(x, others=(), probability=0.0) for x in forms))
+    forms = [] if was is None else [x for x in (was, *was.others) if x.hypothesis.name != mine.hypothesis.name]
+    first = RankedHypothesis(mine.hypothesis, linear.findings.final, here - none, 1.0 / total,
+                             tuple(replace(x, others=(), probability=0.0) for x in forms))
     return (first, *sorted(found, key=lambda r: -r.probability))
