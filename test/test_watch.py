@@ -2,6 +2,8 @@
 """The node `watch` beside a running plant: topics, states, page, alarm bag."""
 
 import json
+import subprocess
+import sys
 import urllib.request
 
 import numpy as np
@@ -55,6 +57,15 @@ def test_the_model_speaks_beside_the_rig_and_the_page_shows_what_is_published(gr
         assert b"http://" not in answer.read()
     assert graph.call(Trigger, "watch/clear", Trigger.Request()).success
     assert watch.stop() == 0
+
+
+def test_a_folder_for_bags_that_cannot_be_made_is_refused_at_the_start(tmp_path):
+    (tmp_path / "file").write_text("")
+    done = subprocess.run([sys.executable, "-m", "aeropend_ident.nodes.watch",
+                           *parameters(bags=str(tmp_path / "file" / "alarms"))], capture_output=True, text=True,
+                          timeout=60, check=False)
+    assert done.returncode == 2
+    assert f"alarms cannot be written ({tmp_path / 'file'} is a file); give another folder" in done.stderr
 
 
 async def _first_samples() -> list[list[float]]:

@@ -64,6 +64,8 @@ class Link:
             return f"{self.port} is in use by another program: end it"
         if "Permission denied" in text:
             return f"{self.port} may not be opened: join its group (sudo usermod -aG dialout $USER) and log in again"
+        if any(said in text for said in ("Inappropriate ioctl", "Is a directory", "No such device")):
+            return f"{self.port} is no serial port: name that of the board (`doctor` lists the ports)"
         return f"{self.port} cannot be opened: {getattr(error, 'strerror', None) or text}"
 
     def close(self) -> None:

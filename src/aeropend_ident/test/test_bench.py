@@ -82,6 +82,8 @@ def test_the_command_writes_a_model_that_says_where_its_numbers_come_from(tmp_pa
     ("--duty-map", "duty [%],v_a [V]\n0,0\n10,0\n50,1\n100,2\n", "duties give a voltage"),
     ("--duty-map", "duty [1],v_a [V]\n0,0\n10,0\n50,1\n100,2\n", "give it as 0..1"),
     ("--thrust", "v_a [V],thrust [N]\n1,0\n2,0\n3,0\n4,0\n", "0 rows hold"),
+    ("--thrust", "v_a [V],omega [rpm],thrust [N]\n1.5,0.1\n2.5,0.2\n3.5,0.3\n",
+     "3 names (v_a [V], omega [rpm], thrust [N])"),
     ("--thrust", "v_a [V],omega [rpm]\n1,0\n2,0\n3,0\n4,0\n", "neither thrust nor theta"),
     ("--current-step", "t [ms],i_a [A]\n" + "".join(f"{k},0\n" for k in range(9)), "does not rise"),
 ])

@@ -10,6 +10,7 @@ import pytest
 from aeropend_ident.bags.recording import RecordingError, read
 from aeropend_ident.checkup.bag import checks, contents
 from aeropend_ident.commands.step_response import main as step_response
+from aeropend_ident.commands.step_response import other_law
 from aeropend_ident.signals.from_bag import as_signals
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import rig
@@ -113,6 +114,16 @@ def test_two_publishers_are_said_where_the_angle_jumps_between_them(bags, tmp_pa
     assert not any("its zero was set there" in text for text in said)
 
 
+def test_two_publishers_with_the_same_stamps_are_said(bags, tmp_path, good):
+    same = [message for message in good.messages if message[0] == "/armature"]
+    other = [("/joint_states", JOINT, stamp, bags.joint(stamp, [2.0, NAN], [NAN, 50.0], ("arm", "rotor")))
+             for stamp in good.arrays["stamp_ns"].tolist()]
+    said = read(bags.write(tmp_path / "bag", bags.Content([*good.messages, *same, *other]))).notes
+    assert any(f"{len(other)} messages of /joint_states have the stamp of another and other values" in note
+               for note in said)
+    assert not any("of /armature have the stamp of another" in note for note in said)
+
+
 def test_a_pause_is_no_loss_of_samples(bags, tmp_path, good):
     recording = read(bags.write(tmp_path / "bag", good))
     paused = replace(recording, gaps=np.array([[100, 2000]]))
@@ -132,6 +143,14 @@ def test_step_response_says_which_references_do_not_count(bags, tmp_path, good, 
                                 ("deg", (11.5, 23.0), "its references go from 11.5 to 23; give the --law that ran")):
         assert step_response([bag(name, *levels)]) == 2
         assert words in capsys.readouterr().err
+
+
+def test_step_response_says_which_law_the_references_fit():
+    reference = np.repeat([0.2, 0.4], 500)
+    grid = {"theta": reference + 0.01, "omega": np.full(1000, 130.0), "reference": reference}
+    (said,) = other_law(grid, "cascade")
+    assert said.startswith("theta follows these references, omega does not: give --law ")
+    assert other_law(grid, "feedback_linearization") == []
 
 
 def test_a_table_that_is_no_bag_names_the_command_that_makes_one(tmp_path):

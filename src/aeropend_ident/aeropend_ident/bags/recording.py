@@ -507,11 +507,18 @@ class _Join:
             raise RecordingError(f"{series.topic}: header.stamp is never set, so its samples cannot be dated or "
                                  "joined: set it to the instant of each sample in the program that publishes them")
         rows = np.flatnonzero(understood)
-        sorted_stamps, first, times = np.unique(stamps[rows], return_index=True, return_counts=True)
+        sorted_stamps, first, group, times = np.unique(stamps[rows], return_index=True, return_inverse=True,
+                                                       return_counts=True)
         if len(times) and times.max() >= STANDS:
             self.notes.append(f"{int(times.max())} messages of {series.topic} have one stamp: the clock that stamps "
                               "them stands still; all but the first are left out")
         self.duplicates += len(rows) - len(first)
+        kept = rows[first][group]
+        differs = np.any([(x[rows] != x[kept]) & np.isfinite(x[rows] + x[kept]) for x in columns.values()], axis=0)
+        if apart := int(differs.sum()):
+            self.notes.append(f"{counted(apart, 'message')} of {series.topic} {_has(apart)} the stamp of another and "
+                              "other values: two programs publish it (`ros2 topic info -v` lists them: end one, and "
+                              "record again)")
         rows = rows[first]
         received = np.array(series.times, dtype=np.int64)[rows]
         return _Table(sorted_stamps, received, {name: values[rows] for name, values in columns.items()})

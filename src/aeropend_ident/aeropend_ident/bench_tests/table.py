@@ -41,6 +41,9 @@ def read_rows(path: Path, columns: str | None = None) -> Rows:
     names = [column.name for column in table.columns] if columns is None else columns.split(",")
     if len(names) != len(table.columns):
         raise BenchTestError(f"{path}: has {len(table.columns)} columns, --columns names {len(names)}")
+    if columns is None and not any(names):
+        why = "; ".join(table.notes) or "its first line names no columns"
+        raise BenchTestError(f"{path}: {why}; give each column a name and a unit in the first line, or with --columns")
     found = {}
     for column, cell in zip(table.columns, names):
         name, size, low = _column(cell, path)

@@ -28,6 +28,10 @@ from aeropend_sim.wording import counted
 SHORTEST_S = 1.0
 """A last step held for less is left out: recordings end at any time."""
 
+FOLLOWS = 0.1
+"""Median distance from the references, over that of what the law controls, below which another reading follows them
+(choice: radians and radians per second differ by more)."""
+
 EXAMPLES = f"""\
 examples:
   step_response my_bag
@@ -112,6 +116,21 @@ def remarks(recording: Recording, law: str) -> list[str]:
     return out + [named(mistakes.said([one]), recording.path) for one in likely]
 
 
+def other_law(grid: dict[str, step_report.Array], law: str) -> list[str]:
+    """What to know where the references fit another measured variable than that of the law.
+
+    Args:
+        grid: columns (M,) on a grid.
+        law: a key of `LAWS`.
+    """
+    mine = LAWS[law].measures
+    off = {kind.measures: float(np.nanmedian(np.abs(grid[kind.measures] - grid["reference"])))
+           for kind in LAWS.values() if np.isfinite(grid[kind.measures]).any()}
+    return [f"{measured} follows these references, {mine} does not: give --law {' or '.join(laws)}, if that ran"
+            for measured in off if off[measured] < FOLLOWS * off[mine]
+            and (laws := [name for name, kind in LAWS.items() if kind.measures == measured])]
+
+
 def run(options: argparse.Namespace) -> None:
     """Read, describe, print, draw.
 
@@ -135,7 +154,7 @@ def run(options: argparse.Namespace) -> None:
         except OSError as error:
             raise OutputError(f"{options.plot} cannot be written: {error.strerror}") from None
     console = Console(width=None if sys.stdout.isatty() else 120)
-    for note in (*recording.notes, *remarks(recording, options.law)):
+    for note in (*recording.notes, *remarks(recording, options.law), *other_law(grid, options.law)):
         print(printable(f"note: {note}"))
     console.print(step_report.table({options.law: described}, {options.law: kind.reference_unit}))
 

@@ -156,10 +156,10 @@ def _check_alive(name: str, columns: Mapping[str, Array]) -> None:
     for column, x in columns.items():
         if np.ptp(x) == 0.0:
             raise RecordingError(f"{name}: {column} is {x[0]:g} all the time, so no equation with it can be "
-                                 "identified; record while `excite` runs, or leave it out (identify --states, --input)")
+                                 "identified; record while `excite` runs, or identify without it (--states, --input)")
         if np.std(x) < STANDS_OUT * float(noise_of(x)):
             raise RecordingError(f"{name}: {column} varies too little beside its noise, so no equation with it can be "
-                                 "identified; record while `excite` runs, or leave it out (identify --states, --input)")
+                                 "identified; record while `excite` runs, or identify without it (--states, --input)")
 
 
 def from_bag(read: Recording, sensing: Mapping[str, float], states: Sequence[str] = STATES,
@@ -289,12 +289,12 @@ def _check_channel(read: Recording, name: str) -> None:
     x = getattr(read, name)
     holes = int((~np.isfinite(x)).sum())
     if holes == len(x):
-        raise RecordingError(f"{read.path}: {name} was not measured; record it, or leave it out (identify --states, "
+        raise RecordingError(f"{read.path}: {name} was not measured; record it, or identify without it (--states, "
                              "--input)")
     if holes:
         raise RecordingError(f"{read.path}: {name} is not a number in {holes} of {len(x)} samples; identification "
-                             "needs a recording without holes: mend the sensor and record again, or leave it out "
-                             "(identify --states, --input)")
+                             "needs a recording without holes: mend the sensor and record again, or identify without "
+                             "it (--states, --input)")
     _check_alive(read.path, {name: x})
 
 

@@ -91,7 +91,8 @@ def quality(model: Model, data: Dataset, show: Show = nothing) -> list[Excited]:
     fitter = Fitter(problem.experiment(len(data)), Entries.of(start), 0, floor=1.0)
     every = Entries.candidates(problem.candidates)
     if fitter.run(*fitter.point) is None:
-        raise RecordingError(f"{data.name}: the model diverges on it, so there is no result; check the model file")
+        raise RecordingError(f"{data.name}: the model diverges on it, so there is no result: check the model file, or "
+                             f"record faster (its samples are {1e3 * data.period:.3g} ms apart)")
     show(0.1, "fitting the readings")
     fitter.fit(rounds=5)
     show(0.5, "testing every term")

@@ -9,6 +9,7 @@ the minute around it into a bag. Nothing that it publishes moves the rig.
 from __future__ import annotations
 
 import math
+import os
 import subprocess
 import sys
 import threading
@@ -101,7 +102,7 @@ class Watch(Node):
         """Prepare.
 
         Raises:
-            UserError: a parameter or the model file cannot be used.
+            UserError: a parameter, the model file or the folder for bags cannot be used.
         """
         super().__init__("watch", automatically_declare_parameters_from_overrides=True)
         given = overrides(self)
@@ -109,6 +110,8 @@ class Watch(Node):
             raise UserError("give the parameters of a model as a file: -p model:=FILE")
         settings = read_settings(self, SETTINGS, given)
         self._settings = settings
+        if settings["bags"]:
+            _check_writable(Path(settings["bags"]))
         self._watcher = Watcher(load(settings["model"]), settings["mean_hours"])
         self._intake = Intake()
         self._ring = Ring()
@@ -397,6 +400,14 @@ def _status(name: str, place: Place) -> DiagnosticStatus:
 
 _ARM, _ROTOR = interface.JOINTS
 _NO_SAMPLES = "no samples: plant or bridge does not publish"
+
+
+def _check_writable(folder: Path) -> None:
+    """Refuse a folder in which no bag can be made, at the start and not at the first alarm."""
+    there = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
+    if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
+        raise UserError(f"bags: {folder} cannot be written ({there} is {'not yours' if there.is_dir() else 'a file'}); "
+                        "give another folder, as in -p bags:=alarms, or an empty name for no bags")
 
 
 def _ignore(message: bytes) -> None:

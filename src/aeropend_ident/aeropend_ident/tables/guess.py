@@ -444,8 +444,9 @@ def _command_scale(one: Seen, angle: Seen, given: Given) -> scales.Scale:
         unit, why, sure = scales.of_command(np.abs(x) if low < 0.0 else x, list(one.words), counts=one.counts,
                                            units=bool(angle.column.unit))
     if low < 0.0 and -low > 0.005 * top:
-        why += f"; it goes both ways, {low:.4g} to {top:.4g}" + ": add --both-ways reverse, brake or clip" * (
-            not given.both_ways)
+        why += f"; it goes both ways, {low:.4g} to {top:.4g}" + (
+            ": add --both-ways reverse, brake or clip; if its least value is the motor off, shift it in the file first"
+            ) * (not given.both_ways)
         sure = sure and given.both_ways
     return unit, why, sure
 
