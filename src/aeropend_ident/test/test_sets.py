@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sets of effects: the log evidence of a linear model, and effects that stood in for others."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -54,6 +55,12 @@ def test_a_column_that_is_fixed_is_added_as_it_is():
 
 
 @pytest.fixture(scope="module")
+def pool():
+    with ThreadPoolExecutor(2) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
 def chains():
     """A rig whose thrust lags, and whose arm has drag."""
     effects = {"thrust_lag": {"tau": 0.04}, "quadratic_drag": {"k": 0.3}}
@@ -83,18 +90,18 @@ def test_the_linear_model_predicts_the_fit_of_a_set(chains):
     assert there.values["quadratic_drag.k"] == pytest.approx(0.3, rel=0.2)
 
 
-def test_effects_that_stand_in_for_others_give_way_to_them(chains):
+def test_effects_that_stand_in_for_others_give_way_to_them(chains, pool):
     findings, nominal, candidates = found_alone(chains, "encoder_lag", "axial_inflow")
-    best = with_best_set(chains, findings, nominal, candidates)
+    best = with_best_set(chains, findings, nominal, candidates, pool)
     assert {h.name for h in best.effects} == {"thrust_lag", "quadratic_drag"}
     assert best.final.values["thrust_lag.tau"] == pytest.approx(0.04, rel=0.1)
     assert all(selection[0].probability > 0.9 for selection in best.found)
     assert all(r.probability < 0.1 for selection in best.found for r in selection[1:])
 
 
-def test_the_right_set_stays_as_it_is(chains):
+def test_the_right_set_stays_as_it_is(chains, pool):
     findings, nominal, candidates = found_alone(chains, "thrust_lag", "quadratic_drag")
-    assert with_best_set(chains, findings, nominal, candidates) is findings
+    assert with_best_set(chains, findings, nominal, candidates, pool) is findings
 
 
 def test_the_sets_that_are_likely_are_those_whose_fits_are(chains):
@@ -113,10 +120,10 @@ def test_an_effect_that_closes_less_than_a_trifle_is_taken_out(chains):
     assert len(_without_unneeded(chains, findings, nominal, 1.0).effects) == 1
 
 
-def test_a_search_that_starts_from_the_wrong_lag_ends_at_the_right_one(chains):
+def test_a_search_that_starts_from_the_wrong_lag_ends_at_the_right_one(chains, pool):
     """No small step leads from one to the other, but a contender of the first round is a start too."""
     wrong, nominal, candidates = found_alone(chains, "encoder_lag", "quadratic_drag")
     right, *_ = found_alone(chains, "thrust_lag")
     findings = replace(wrong, found=((wrong.found[0][0], right.found[0][0]), wrong.found[1]))
-    best = with_best_set(chains, findings, nominal, candidates)
+    best = with_best_set(chains, findings, nominal, candidates, pool)
     assert {h.name for h in best.effects} == {"thrust_lag", "quadratic_drag"}

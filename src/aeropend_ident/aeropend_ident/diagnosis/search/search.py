@@ -180,9 +180,9 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
     several = in_sets and not passes_as_noise(findings.final, MATERIAL)
     if not passed(deadline):
         if several:
-            findings = _with_best_set(chains, findings, nominal, candidates)
+            findings = _with_best_set(chains, findings, nominal, candidates, pool)
         else:
-            findings = _with_best_forms(chains, _with_better_rivals(chains, findings, nominal), nominal)
+            findings = _with_best_forms(chains, _with_better_rivals(chains, findings, nominal), nominal, pool)
     findings = _without_unneeded(chains, findings, nominal, trifle)
     if findings.found and several and not passed(deadline):
         findings = replace(findings, sets=likely_sets(chains, findings, nominal, candidates))
@@ -190,13 +190,15 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
 
 
 def _with_best_set(chains: CutChains, findings: Findings, nominal: list[Parameter],
-                   candidates: Sequence[Hypothesis]) -> Findings:
+                   candidates: Sequence[Hypothesis], pool: ThreadPoolExecutor) -> Findings:
     """The best set of effects, each in its best form beside the others; another form may lead to another set."""
     for done in range(FORMED_ANEW):
-        best = with_best_set(chains, findings, nominal, candidates, contenders=not done)
+        best = with_best_set(chains, findings, nominal, candidates, pool, contenders=not done)
         if best is findings:
             break
-        findings = _with_best_forms(chains, best, nominal)
+        findings = _with_best_forms(chains, best, nominal, pool)
+        if findings.final is best.final:
+            break
     return findings
 
 
@@ -291,32 +293,36 @@ def _swapped(chains: CutChains, findings: Findings, nominal: list[Parameter], k:
     return replace(findings, found=(*findings.found[:k], swapped, *findings.found[k + 1:]), final=f)
 
 
-def _with_best_forms(chains: CutChains, findings: Findings, nominal: list[Parameter]) -> Findings:
+def _with_best_forms(chains: CutChains, findings: Findings, nominal: list[Parameter], pool: ThreadPoolExecutor
+                     ) -> Findings:
     """Choose the form of each effect again beside the others: alone, it may have stood in for one of them."""
     if len(findings.found) < 2:
         return findings
     for k, (first, *rivals) in enumerate(findings.found):
         if first.others:
-            best, *others = _forms_beside(chains, findings, _beside(findings, nominal, first.hypothesis), first)
+            best, *others = _forms_beside(chains, findings, _beside(findings, nominal, first.hypothesis), first, pool)
             found = (replace(best, others=shared(best, others)), *rivals)
             findings = replace(findings, found=(*findings.found[:k], found, *findings.found[k + 1:]), final=best.fit)
     return findings
 
 
-def _forms_beside(chains: CutChains, findings: Findings, beside: list[Parameter], first: RankedHypothesis
-                  ) -> list[RankedHypothesis]:
+def _forms_beside(chains: CutChains, findings: Findings, beside: list[Parameter], first: RankedHypothesis,
+                  pool: ThreadPoolExecutor) -> list[RankedHypothesis]:
     """The forms of an effect that was found, each fitted beside the other effects; the best first."""
-    def fitted(h: Hypothesis, begun: Mapping[str, float]) -> Fit:
-        return fit(chains.residuals(findings.stage), started(adopted(beside, h), begun))
+    def fitted(begun: Sequence[tuple[Hypothesis, Mapping[str, float]]]) -> list[tuple[Hypothesis, Fit]]:
+        fits = [pool.submit(fit, chains.residuals(findings.stage), started(adopted(beside, h), values))
+                for h, values in begun]
+        return [(h, f.result()) for (h, _), f in zip(begun, fits, strict=True)]
 
     now = findings.final.values
     tried = [(first.hypothesis, findings.final)]
-    tried += [(r.hypothesis, fitted(r.hypothesis, {**now, **{p.name: r.fit.values[p.name] for p in r.hypothesis.own}}))
-              for r in first.others]
+    tried += fitted([(r.hypothesis, {**now, **{p.name: r.fit.values[p.name] for p in r.hypothesis.own}})
+                     for r in first.others])
     lead, led = max(tried, key=lambda one: one[1].log_likelihood)
-    again = [f if h is lead or len(h.own) > len(lead.own) else fitted(h, as_form(lead, h, led.values))
-             for h, f in tried]  # a form with fewer parameters may serve as well with those of the likeliest
-    tried = better(tried, again)
+    # a form with fewer parameters may serve as well with those of the likeliest
+    again = dict(fitted([(h, as_form(lead, h, led.values)) for h, _ in tried
+                         if h is not lead and len(h.own) <= len(lead.own)]))
+    tried = better(tried, [again.get(h, f) for h, f in tried])
     ess = largest_ess([f for _, f in tried])
     gains = [f.log_evidence(ess) - findings.final.log_evidence(ess) + h.log_odds - first.hypothesis.log_odds
              for h, f in tried]

@@ -10,6 +10,7 @@ fitted; the search goes on from there until no set is better.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import NamedTuple
@@ -278,7 +279,7 @@ def names(members: Set) -> frozenset[str]:
 
 
 def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Parameter],
-                  candidates: Sequence[Hypothesis], *, contenders: bool = True) -> Findings:
+                  candidates: Sequence[Hypothesis], pool: ThreadPoolExecutor, *, contenders: bool = True) -> Findings:
     """The findings of a stage with the set of effects that has most log evidence.
 
     The search starts from what was found, and from each contender of the first round alone that closes about as much: a
@@ -289,6 +290,7 @@ def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Param
         findings: what was found so far.
         nominal: parameters of the stage without effects.
         candidates: effects that may be members of a set.
+        pool: threads.
         contenders: whether to start from each contender of the first round too.
     """
     found = {h.name for h in findings.effects}
@@ -299,9 +301,10 @@ def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Param
              if {r.hypothesis.name} != found and x <= ALIKE * min(left)]
     seen: set[frozenset[str]] = set()
     best = _climbed(chains, findings, nominal, candidates, seen)
-    for r in alone if contenders else []:
-        start = replace(findings, found=((r,),), final=r.fit)
-        there = _climbed(chains, start, nominal, candidates, seen)
+    climbs = [pool.submit(_climbed, chains, replace(findings, found=((r,),), final=r.fit), nominal, candidates, {*seen})
+              for r in alone if contenders]
+    for climb in climbs:
+        there = climb.result()
         if _gain(best.findings, there.findings.effects, there.findings.final) > LEAST:
             best = there
     if best.findings is findings:
