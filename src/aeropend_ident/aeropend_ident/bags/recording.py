@@ -514,7 +514,8 @@ class _Join:
                               "them stands still; all but the first are left out")
         self.duplicates += len(rows) - len(first)
         kept = rows[first][group]
-        differs = np.any([(x[rows] != x[kept]) & np.isfinite(x[rows] + x[kept]) for x in columns.values()], axis=0)
+        differs = np.any([(x[rows] != x[kept]) & np.isfinite(x[rows]) & np.isfinite(x[kept])
+                          for x in columns.values()], axis=0)
         if apart := int(differs.sum()):
             self.notes.append(f"{counted(apart, 'message')} of {series.topic} {_has(apart)} the stamp of another and "
                               "other values: two programs publish it (`ros2 topic info -v` lists them: end one, and "
