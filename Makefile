@@ -33,7 +33,6 @@ live: .venv/.runtime ## run a plant that changes and watch it in the browser (AR
 test: .venv/.dev ## build and test with colcon in a temporary folder, then run every test (ARGS="-k plant")
 	tools/setup test
 	$(MAKE) -C firmware
-	tools/colcon-check
 	tools/test $(ARGS)
 
 bench: .venv/.dev ## measure speed beside C, scipy, pysindy and rosbags (ARGS=--quick; ARGS=--docs writes docs/results/bench.md)
