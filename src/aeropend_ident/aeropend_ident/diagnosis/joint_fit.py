@@ -108,10 +108,10 @@ class JointFit:
         return {n: v for n, v in self.values.items() if own or key(n).is_initial or not key(n).recording}
 
     def without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
-        """The values that leave the smallest gap without some of the effects.
+        """The values that leave the smallest gap without some of the effects, the others at their sizes.
 
-        Calibrated parameters stay within their tolerances. What comes back is what no other parameter could take over.
-        The values are fitted once.
+        Calibrated parameters stay within their tolerances. What comes back is what no parameter of the model could take
+        over. The values are fitted once.
         """
         names = frozenset(h.name for h in effects)
         if names not in self._fitted_without:
@@ -120,28 +120,18 @@ class JointFit:
 
     def _fit_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         gone = {p.name for h in effects for p in h.own}
-        kept = [j for j, p in enumerate(self._bounded) if p.name not in gone or p.name in self._nominal]
-        parameters = [self._back(p) if p.name in gone else p for p in (self._bounded[j] for j in kept)]
-        slopes = {channel: s.of(kept) for channel, s in self._slopes.items()}
-        start = min(self._starts_without(effects), key=self._cost)
-        return within_bounds(self._of_spread, started(parameters, start), slopes, AGAIN_STEPS)
+        held = {n: self.values[n] for n in self._of_effects - gone}
+        free = [j for j, p in enumerate(self._bounded) if p.name not in self._of_effects
+                or (p.name in gone and p.name in self._nominal)]
+        parameters = [self._back(p) if p.name in gone else p for p in (self._bounded[j] for j in free)]
+        slopes = {channel: s.of(free) for channel, s in self._slopes.items()}
+        return held | within_bounds(lambda values: self._of_spread(held | values), started(parameters, self.values),
+                                    slopes, AGAIN_STEPS)
 
-    def _starts_without(self, effects: Collection[Hypothesis]) -> list[dict[str, float]]:
-        """Where a fit without some effects may start: as if the readings were linear, or without all of their stages.
-
-        The second can be poor, but no fit may end above it: the readings may be far from linear in an effect.
-        """
-        stages = [f.effects for f in self.findings.values() if any(h in f.effects for h in effects)]
-        every = [h for of_stage in stages for h in of_stage]
-        starts = [self.expected_without(effects)]
-        if len(every) > len(effects):
-            off = {p.name: neutral(self.chains.model, p.name) for h in every if h not in effects for p in h.own[:1]}
-            starts.append({**self.values, **off, **self.without(every)})
-        return starts
-
-    def _cost(self, values: dict[str, float]) -> float:
-        """Sum of the squared residuals, in units of the channels' spread."""
-        return sum(float(r @ r) for r in self._of_spread(values).values())
+    @cached_property
+    def _of_effects(self) -> set[str]:
+        """The names of the parameters that effects have."""
+        return {p.name for f in self.findings.values() for h in f.effects for p in h.own}
 
     @cached_property
     def _nominal(self) -> dict[str, Parameter]:
@@ -156,8 +146,8 @@ class JointFit:
     @cached_property
     def _bounded(self) -> list[Parameter]:
         """All parameters, each within its range; calibrated ones within their tolerances, or up to the estimate."""
-        own = {p.name for f in self.findings.values() for h in f.effects for p in h.own}
-        return [p if n in own else self._within_tolerance(p, self.values[n]) for n, p in self.parameters.items()]
+        return [p if n in self._of_effects else self._within_tolerance(p, self.values[n])
+                for n, p in self.parameters.items()]
 
     @cached_property
     def _slopes(self) -> dict[str, Sensitivities]:
