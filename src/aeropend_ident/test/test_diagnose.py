@@ -137,7 +137,10 @@ def test_the_preset_is_a_model_of_itself(tmp_path, bags):
     duty = steps(20.0, 12)
     columns, _ = rig.record(BENCH, duty, 12)
     path = bags.write(tmp_path / "own", bags.content(len(duty), columns={**columns, "duty": duty}))
-    assert here(path, "--out", tmp_path / "out").stdout.startswith("verdict: none")
+    said = here(path, "--out", tmp_path / "out").stdout
+    assert said.startswith("verdict: none")
+    (command,) = (line.partition(": isolate ")[2] for line in said.splitlines() if ": isolate " in line)
+    assert shlex.split(command) == [str(path), "--model", "bench"]
     body = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert body["shrink"]["gap"] < 1.5 * body["shrink"]["floor"]
     assert np.isfinite(body["seconds"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -150,6 +151,9 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
         lines.append(changes.verdict_line(document.since, document.where.place))
     elif which.verdict == "none":
         lines.append(f"verdict: none. {_spaced(headline)}")
+        if document.identified is None and len(document.bags) == 1:
+            words = shlex.join(["isolate", *document.bags, "--model", document.model])
+            lines.append(f"  how small an effect would still show in it: {words}")
     elif which.verdict == CANNOT_TELL:
         lines.append(f"verdict: cannot tell. {why[:1].upper()}{why[1:]}.")
     elif which.verdict == "unknown":
