@@ -200,7 +200,7 @@ def part_of_spikes(spikes: RankedHypothesis, with_: Gap, without: Gap) -> Part:
     return replace(part, amount=max(part.amount, 0.0))
 
 
-def shares(parts: Sequence[Part], *, shared: float = SHARED, seed: int = 0) -> dict[str, Interval]:
+def shares(parts: Sequence[Part], *, shared: float = SHARED, ends: bool = True, seed: int = 0) -> dict[str, Interval]:
     """Name -> share of the gap, with a 95 % interval.
 
     The interval holds the scatter over time (block bootstrap, H. Künsch, 1989) and the uncertainty of the size. It also
@@ -210,7 +210,8 @@ def shares(parts: Sequence[Part], *, shared: float = SHARED, seed: int = 0) -> d
 
     Args:
         parts: of the gap.
-        shared: as `SHARED`; 0 leaves out what is unexplained, and the ends.
+        shared: as `SHARED`; 0 leaves out what is unexplained.
+        ends: whether the intervals reach to the ends of the parts.
         seed: of the bootstrap.
     """
     captures = {p.name: Interval(1.0, 1.0, 1.0) for p in parts if p.name == CAPTURES and p.amount > 0.0}
@@ -231,12 +232,11 @@ def shares(parts: Sequence[Part], *, shared: float = SHARED, seed: int = 0) -> d
             mixed = np.maximum(np.sqrt(np.maximum(d, 0.0)) + shared * rest * rng.standard_normal(RESAMPLES), 0.0) ** 2
             d[:] = np.where(d > 0.0, mixed, d)
     drawn = np.clip(drawn, -1.0, 1.0)
-    ends = np.percentile(drawn, [2.5, 97.5], axis=1)
     found = captures
-    for p, low, high in zip(parts, *ends, strict=True):
+    for p, low, high in zip(parts, *np.percentile(drawn, [2.5, 97.5], axis=1), strict=True):
         if p.name:
             share = p.amount / total
-            least, most = (end / total for end in p.ends) if shared else (share, share)
+            least, most = (end / total for end in p.ends) if ends else (share, share)
             found[p.name] = Interval(share, max(min(float(low), share, least), -1.0),
                                      min(max(float(high), share, most), 1.0))
     return found
@@ -249,13 +249,14 @@ def headline(parts: Sequence[Part], share: Mapping[str, Interval], material: flo
         parts: of the gap.
         share: of `shares`.
         material: share from which the largest finding is claimed, if its interval is above 0; a further effect, if it
-            is surely there.
+            is surely there. How much it closes depends on the others; whether it is there does not, so that the
+            ends of its part do not count.
     """
     named = sorted((p for p in parts if p.name), key=lambda p: -p.amount)
-    scatter = shares(parts, shared=0.0)
+    scatter, sure = shares(parts, shared=0.0, ends=False), shares(parts, ends=False)
     likely = [p for p in named if p.name in share and share[p.name].value >= material
               and (p.name == UNKNOWN or scatter[p.name].low > 0.0)]
-    claimed = [p for p in likely if p is likely[0] or p.name == UNKNOWN or share[p.name].low >= SURELY * material]
+    claimed = [p for p in likely if p is likely[0] or p.name == UNKNOWN or sure[p.name].low >= SURELY * material]
     effects = _ids(p for p in claimed if p.name != UNKNOWN)
     small = [e for e in _ids(p for p in named if p not in claimed and p.name != UNKNOWN) if e not in effects]
     names = {p.name for p in claimed}
