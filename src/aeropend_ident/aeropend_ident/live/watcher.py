@@ -67,7 +67,8 @@ class Watcher:
         alarm: the change that was found, until `clear`.
         places: state of each place.
         free_gap: [floors] RMS of measured minus free-running model by channel, over about the last second.
-        note: why nothing is judged at present; "" if it is.
+        fault: why the samples cannot be judged; "" if they can.
+        to_learn: [s] of motion that is needed before anything is judged.
     """
 
     def __init__(self, model: Model, mean_hours: float = 24.0, period: float = SAMPLE_PERIOD) -> None:
@@ -77,10 +78,15 @@ class Watcher:
         self.detector = Detector(bank, limit(mean_hours))
         self.places = {place: Place(STALE) for place in PLACES}
         self.free_gap = dict.fromkeys(CHANNELS, 0.0)
-        self.note = "no sample yet"
+        self.fault, self.to_learn = "no sample yet", LEARNS
         self.breaks = 0
         self._duty = self._spread = 0.0
         self._epoch_ns = 0  # stamp at time 0 of the detector
+
+    @property
+    def note(self) -> str:
+        """Why nothing is judged at present; "" if it is."""
+        return self.fault or (f"learning the rig: {self.to_learn:.0f} s of motion left" if self.to_learn else "")
 
     @property
     def alarm(self) -> Finding | None:
@@ -110,7 +116,7 @@ class Watcher:
                 np.concatenate(residuals.said)).all():
             self.companion.restart()  # impossible readings have driven a model out of all range
             self.detector.restart()
-            self.note = "the readings are impossible"
+            self.fault = "the readings are impossible"
             return residuals, None
         self._compare(batch, residuals)
         if frozen:
@@ -123,8 +129,7 @@ class Watcher:
             self._epoch_ns = int(batch.stamps[-1]) - round(d.time * 1e9)
             if d.tick % JUDGED == 0:
                 found = d.judge()
-                left = LEARNS - d.learned
-                self.note = f"learning the rig: {left:.0f} s of motion left" if left > 0.0 else ""
+                self.fault, self.to_learn = "", max(LEARNS - d.learned, 0.0)
                 self._look()
         return residuals, found
 
@@ -140,7 +145,7 @@ class Watcher:
         self._look()
 
     def _stale(self, why: str) -> None:
-        self.note = why
+        self.fault = why
         for name, place in self.places.items():
             if place.state != PARTED:
                 self.places[name] = Place(STALE)

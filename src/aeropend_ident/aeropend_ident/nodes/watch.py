@@ -267,12 +267,12 @@ class Watch(Node):
                 self._tell(watcher.alarm, "as it now looks, they have parted")
         if batches:
             self._lag_ms = (time.time_ns() - int(batches[-1].stamps[-1])) * 1e-6
-        elif now - self._heard > SILENT_S and watcher.note != _NO_SAMPLES and self._heard > -math.inf:
+        elif now - self._heard > SILENT_S and watcher.fault != _NO_SAMPLES and self._heard > -math.inf:
             watcher.silent(_NO_SAMPLES)
             self._intake.forget()
             self._warn(_NO_SAMPLES)
-        if watcher.note not in ("", _NO_SAMPLES) and not watcher.note.startswith("learning") and batches:
-            self._warn(watcher.note)
+        if watcher.fault not in ("", _NO_SAMPLES) and batches:
+            self._warn(watcher.fault)
         if self._bag is not None:
             self._write_bag()
         if self._page is not None:
@@ -352,7 +352,7 @@ class Watch(Node):
     def _report(self) -> tuple[str, Mapping[str, object]]:
         watcher, gap = self._watcher, self._watcher.free_gap
         alarm = watcher.alarm
-        warnings = ["" if watcher.note.startswith("learning") else watcher.note]
+        warnings = [watcher.fault]
         if alarm is not None:
             warnings.append(f"parted at {alarm.place}")
         values = {
@@ -360,7 +360,7 @@ class Watch(Node):
             "malformed": self._malformed, "breaks": watcher.breaks, "alarms": self._alarms,
             "lost": sum(r.lost for r in self._recorders.values()),
             **{f"free run {channel}": gap[channel] for channel in gap},
-            "learning": watcher.note if watcher.note.startswith("learning") else "done",
+            "learning": f"{watcher.to_learn:.0f} s of motion left" if watcher.to_learn else "done",
             "statistic": watcher.detector.statistic, "limit": watcher.detector.limit,
             "lag ms": self._lag_ms, "cpu share": self._cpu_share.since_last(),
         }
