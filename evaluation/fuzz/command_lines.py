@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nine commands that read a recording, and command lines for them drawn at random."""
+"""The ten commands that read a recording, and command lines for them drawn at random."""
 
 from __future__ import annotations
 
@@ -144,6 +144,15 @@ def excitation_quality(draw: Draw, bags: Sequence[Path], files: Path) -> list[st
             *draw.option(0.4, "--kind", [*KINDS, "x"])]
 
 
+def isolate(draw: Draw, bags: Sequence[Path], files: Path) -> list[str]:
+    """A recording whose duty, channels and noise are taken."""
+    return [str(bags[0]), *draw.some(0.9, "--no-sensors"), *model(draw, files, 0.3), "--jobs", "1",
+            *draw.option(0.5, "--channels", ["theta", "omega", "i_a", "v_a", "x"]), *draw.some(0.3, "--json"),
+            *draw.option(0.4, "--size", ["brush_drop=0.1", "brush_drop=nan", "brush_drop=-1", "x=1",
+                                         "thrust_lag=1e300"]),
+            *draw.option(0.15, "--effects", [str(files / "effects.yaml")])]
+
+
 def import_(draw: Draw, bags: Sequence[Path], files: Path) -> list[str]:
     """A recording, or a table of one, with any options."""
     if draw.chance(0.35):
@@ -258,6 +267,7 @@ COMMANDS = {
     "recover": Command(f"{_COMMANDS}.recover", recover),
     "excitation_quality": Command(f"{_COMMANDS}.excitation_quality", excitation_quality, mildness=0.65,
                                   first=()),
+    "isolate": Command(f"{_COMMANDS}.isolate", isolate, mildness=0.65, longest=20.0),
     "import": Command(f"{_COMMANDS}.import_table", import_),
     "doctor": Command(f"{_COMMANDS}.doctor", doctor, mildness=0.65, several=0.4, first=()),
 }

@@ -12,8 +12,8 @@ from aeropend_ident.commands.isolate import main
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.isolation import chance, structure
 from aeropend_ident.diagnosis.isolation.isolate import isolate, judge_of
-from aeropend_ident.diagnosis.isolation.judge import Judge
-from aeropend_ident.diagnosis.isolation.linear import bounded
+from aeropend_ident.diagnosis.isolation.judge import Judge, Rival, _distinct
+from aeropend_ident.diagnosis.isolation.linear import Column, bounded
 from aeropend_ident.diagnosis.isolation.planned import PlanError, planned
 from aeropend_ident.diagnosis.isolation.sizes import smallest
 from aeropend_ident.diagnosis.report import isolation as page
@@ -205,3 +205,16 @@ def _small(model, recorded, channels, *_, **__):
         finally:
             isolate.__globals__["judge_of"] = whole
     return _KEPT["found"]
+
+
+def test_a_rival_whose_second_parameter_changes_nothing_has_one_column(judge):
+    """The products of two such columns leave nothing of the prior, and cannot be solved."""
+    h = next(h for h in judge.hypotheses if h.effect == "mast_flex")
+    noise = judge.linear.noise["theta"]
+    rows = 1e9 * np.linspace(0.0, 1.0, len(noise))
+    columns = (Column({"theta": rows}, 0.0, 5.0), Column({"theta": rows + 1e-9}, 0.0, 5.0))
+    same = _distinct(Rival(h, ("arm",), columns, (h.own, h.own)))
+    assert len(same.columns) == len(same.starts) == 1
+    assert np.isfinite(judge.linear.fit({"theta": noise}, same.columns).log_prior)
+    apart = replace(same, columns=(columns[0], Column({"theta": rows[::-1]}, 0.0, 5.0)), starts=(h.own, h.own))
+    assert _distinct(apart) is apart

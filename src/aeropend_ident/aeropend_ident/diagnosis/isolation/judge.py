@@ -52,6 +52,9 @@ RUNS_AWAY = 1e6
 MIRRORS = (1.0, -1.0)
 """The noise, and its mirror image."""
 
+ALIKE = 1e-6
+"""Relative difference up to which two columns are the same (choice: far above rounding, and below what noise shows)."""
+
 LEAST = 1e-7
 """Square of a size over that wanted which counts as none (choice: far below any that matters)."""
 
@@ -178,7 +181,7 @@ class Judge:
             heads = [own[0].begin if share is None else own[0].mean + math.copysign(
                 share * usual, own[0].begin - own[0].mean) for own in points]
             columns = [(c, own) for own, at in zip(points, heads, strict=True) if (c := self._column(h, own, at)).rows]
-            found += [Rival(h, stages, (a, b), (one, other)) for (a, one), (b, other) in pairwise(columns)]
+            found += [_distinct(Rival(h, stages, (a, b), (one, other))) for (a, one), (b, other) in pairwise(columns)]
             if len(columns) == 1:
                 found.append(Rival(h, stages, (columns[0][0],), (columns[0][1],)))
         return found
@@ -205,7 +208,7 @@ class Judge:
             columns = tuple(self._column(rival.hypothesis, own, own[0].value(z)) for own in rival.starts)
             if not all(c.rows for c in columns):
                 break
-            rival, before = replace(rival, columns=columns), z
+            rival, before = _distinct(replace(rival, columns=columns)), z
         return rival
 
     # ---- one effect at one size
@@ -312,6 +315,14 @@ class Judge:
         if max(found, key=lambda n: found[n], default="") != own:
             return None
         return {name: p for name, p in found.items() if name != own and p > CALIBRATED.undecided}
+
+
+def _distinct(rival: Rival) -> Rival:
+    """A rival with one column where its two are the same: its second parameter changes nothing there."""
+    first, *others = (c.rows for c in rival.columns)
+    same = others and first.keys() == others[0].keys() and all(
+        np.linalg.norm(x - first[c]) <= ALIKE * np.linalg.norm(first[c]) for c, x in others[0].items())
+    return replace(rival, columns=rival.columns[:1], starts=rival.starts[:1]) if same else rival
 
 
 def _squares(f: Fit) -> dict[str, float]:
