@@ -10,7 +10,7 @@ import pytest
 from aeropend_ident.bags.recording import RecordingError, read
 from aeropend_ident.checkup.bag import checks, contents
 from aeropend_ident.commands.step_response import main as step_response
-from aeropend_ident.commands.step_response import other_law
+from aeropend_ident.commands.step_response import other_law, remarks
 from aeropend_ident.signals.from_bag import as_signals
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import rig
@@ -143,6 +143,8 @@ def test_step_response_says_which_references_do_not_count(bags, tmp_path, good, 
                                 ("deg", (11.5, 23.0), "its references go from 11.5 to 23; give the --law that ran")):
         assert step_response([bag(name, *levels)]) == 2
         assert words in capsys.readouterr().err
+    (said,) = remarks(read(bag("inf", -np.inf, 0.4)), "feedback_linearization")
+    assert said.endswith("as the controller refuses it (first NaN or infinite)")
 
 
 def test_step_response_says_which_law_the_references_fit():

@@ -110,8 +110,9 @@ def remarks(recording: Recording, law: str) -> list[str]:
     out = []
     left = recording.reference[~((recording.reference >= low) & (recording.reference <= high))]
     if len(left):
+        first = f"{left[0]:.4g}" if np.isfinite(left[0]) else "NaN or infinite"
         out.append(f"{counted(len(left), 'reference')} beyond {low:g} to {high:g} {kind.reference_unit} left out, as "
-                   f"the controller refuses it (first {left[0]:.4g})")
+                   f"the controller refuses it (first {first})")
     likely = mistakes.without_model(recording.theta, recording.duty, recording.i_a, recording.v_a)
     return out + [named(mistakes.said([one]), recording.path) for one in likely]
 
