@@ -22,7 +22,7 @@ from aeropend_ident.diagnosis.search.findings import RankedHypothesis
 from aeropend_ident.diagnosis.search.hypotheses import hypotheses
 from aeropend_ident.diagnosis.validation import validate
 from aeropend_ident.estimation.map_fit import estimate
-from aeropend_ident.signals.free_decay import free_swings
+from aeropend_ident.signals.free_decay import _middle, free_swings
 from aeropend_ident.signals.from_bag import as_signals, from_uncalibrated
 from aeropend_ident.signals.grid import irregular_grid
 from aeropend_ident.signals.noise import reading_noise_at, resolution, white_noise_at
@@ -94,6 +94,13 @@ def test_a_push_begins_a_new_swinging():
     swings = free_swings(np.concatenate([a, b]), 1e-3)
     assert len([s for s in swings if s.count >= 4]) == 2
     assert max(swings, key=lambda s: s.stop).size == pytest.approx(1.6, abs=0.2)
+
+
+@pytest.mark.parametrize("turns", [2, 3, 4, 5, 8])
+def test_the_angle_about_which_an_arm_swings_is_that_of_few_swings_too(turns):
+    t = np.arange(0.0, 0.5 + turns / 2, 0.01)
+    x = 0.3 + np.exp(-0.1 * t) * np.cos(2.0 * np.pi * t)
+    assert _middle(x, 1e-3) == pytest.approx(0.3, abs=0.02 if turns > 2 else 0.2)
 
 
 @pytest.mark.promise("Uncalibrated rigs", "A free decay gives gravity, damping, hanging angle and the kind of friction")

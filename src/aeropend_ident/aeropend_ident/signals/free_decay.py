@@ -114,7 +114,8 @@ def _middle(x: Array, sigma: float) -> float:
     v = x[points[1:-1]]  # the ends may not be turning points
     if len(v) < 3:
         return float(np.median(x))
-    return float(np.median((0.25 * (v[:-2] + 2.0 * v[1:-1] + v[2:]))[len(v) // 3:]))
+    middles = 0.25 * (v[:-2] + 2.0 * v[1:-1] + v[2:])
+    return float(np.median(middles[len(middles) // 3:]))
 
 
 def degrees(angle: float) -> str:
