@@ -109,6 +109,7 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
     every = [h for effects in stages for h in effects]
     subsets = {_names(gone): gone for effects in stages for h in effects
                for gone in ([h], _but(effects, h), effects, _but(every, h), every) if gone}
+    joint.without(every)  # what all of them use, once
     with ThreadPoolExecutor(jobs) as pool:
         found = pool.map(lambda gone: held_out.gap_of(joint.without(gone)), subsets.values())
         gaps = {frozenset(): after, **dict(zip(subsets, found, strict=True))}
