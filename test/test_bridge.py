@@ -221,15 +221,6 @@ def test_a_reset_of_the_board(rig, graph, ends):
     assert "the board was reset (reset line)" in rig.bridge.output
 
 
-def test_a_late_answer_of_the_board_is_no_reset(graph, tmp_path):
-    rig = Rig(graph, tmp_path, *away("late"), waits=(0.25, 0.5))
-    try:
-        counters = graph.diagnostics("late/bridge", lambda values: int(values["samples"]) > 500)
-        assert counters["board resets"] == "0"
-    finally:
-        rig.close()
-
-
 @pytest.mark.promise("Hardware", "The motor stops when the host, the bridge or the connection fails")
 def test_the_motor_stops_when_the_host_is_killed(graph, tmp_path):
     rig = Rig(graph, tmp_path, *away("killed"))

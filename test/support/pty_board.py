@@ -12,7 +12,7 @@ import threading
 import time
 import tty
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 from aeropend_bridge import protocol
@@ -31,7 +31,6 @@ class PtyBoard:
         ticks: its clock when it is switched on.
         drift: how much slower its clock runs than the host's, a fraction.
         sample: overrides fields of the samples, given the output-compare value.
-        waits: [s] how late each of the first requests for a HELLO is answered.
 
     Attributes:
         duty: what the output-compare register holds.
@@ -47,12 +46,10 @@ class PtyBoard:
         ticks: int = 1000,
         drift: float = 0.0,
         sample: Callable[[int], dict[str, int]] = lambda duty: {},
-        waits: Sequence[float] = (),
     ) -> None:
         self.path, self.version, self.sample = path, version, sample
         self._period = PERIOD_NS * (1.0 + drift)
         self._ticks = ticks
-        self._waits = deque(waits)
         self.taken: deque[tuple[int, int]] = deque(maxlen=5000)
         self.applied: deque[tuple[int, int]] = deque(maxlen=5000)
         self.commands: list[int] = []
@@ -162,7 +159,6 @@ class PtyBoard:
             self.commands.append(payload[0])
             kind, value = payload[0], payload[1:]
             if kind == Type.HELLO_REQUEST:
-                time.sleep(self._waits.popleft() if self._waits else 0.0)
                 self._hello()
                 continue
             if kind == Type.DUTY:

@@ -44,10 +44,8 @@ RETRY_S = 0.1
 SILENCE_S = 0.1
 """[s] Time without a sample after which the board counts as not connected. A choice."""
 
-ANSWER_S = 2.0
-"""[s] A HELLO later than this after a request is no answer: the board was reset.
-
-A choice: a host under load reads late."""
+ANSWER_S = 0.3
+"""[s] A HELLO later than this after a request is no answer: the board was reset. A choice."""
 
 SETTINGS = {
     "port": Setting("/dev/ttyACM0", "serial port of the board; better a path in /dev/serial/by-id"),
@@ -109,7 +107,7 @@ class Bridge(RigInterface):
         self._settings_sent = self._commanded = 0.0
         self._ignore_until = -math.inf
         self._hello: Hello | None = None
-        self._asked, self._unanswered = -math.inf, 0
+        self._asked = -math.inf
         self._other_version: int | None = None
         self._last: Sample | None = None
         self._last_time = 0
@@ -190,7 +188,7 @@ class Bridge(RigInterface):
                 self._take(samples, arrival_ns)
 
     def _ask(self) -> None:
-        self._asked, self._unanswered = time.monotonic(), self._unanswered + 1
+        self._asked = time.monotonic()
         self._link.write(protocol.hello_request())
 
     def _greet(self, hello: Hello) -> None:
@@ -208,11 +206,10 @@ class Bridge(RigInterface):
         firmware = ".".join(map(str, hello.firmware))
         if self._hello is None:
             self.get_logger().info(f"board at {self._link.port}: firmware {firmware}, build {hello.build:08x}")
-        elif not self._unanswered or time.monotonic() - self._asked > ANSWER_S:
+        elif time.monotonic() - self._asked > ANSWER_S:
             self._counts.board_resets += 1
             self.get_logger().warn(f"the board was reset ({hello.why_reset()}): duty 0 until the next command")
             self._forget_board()
-        self._unanswered = max(self._unanswered - 1, 0)
         with self.lock:
             self._hello = hello
             self._send_settings()
