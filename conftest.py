@@ -31,8 +31,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark those that start nodes, see that tools/test runs each of them, and begin with what takes longest."""
-    allowed = [mark.args[0] if (mark := item.get_closest_marker("timeout")) else 0.0 for item in items]
-    items[:] = [items[k] for k in sorted(range(len(items)), key=lambda k: -allowed[k])]
+    items.sort(key=lambda item: mark.args[0] if (mark := item.get_closest_marker("timeout")) else 0.0, reverse=True)
     for item in items:
         alone = item.get_closest_marker("alone")
         if alone or RUN_NODES & set(getattr(item, "fixturenames", ())):

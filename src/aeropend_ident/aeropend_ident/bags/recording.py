@@ -42,6 +42,9 @@ MOST_NAMES = 8
 OFF = "the stamps do not lie on one grid"
 """What a note says of stamps at irregular times."""
 
+TWO_PROGRAMS = "two programs publish one topic (`ros2 topic info -v` lists them: end one, and record again)"
+"""What a note says of messages that cannot come from one program."""
+
 IRREGULAR = 0.01
 """Share of steps off the grid from which on it is said."""
 
@@ -407,8 +410,7 @@ class _Join:
             are = "is" if missing == 1 else "are"
             self.notes.append(f"{counted(missing, 'sample')} {are} missing in {counted(len(self.gaps), 'gap')}")
         if self.irregular > IRREGULAR * len(self.stamps) or len(self.gaps) > 0.25 * len(self.stamps):
-            self.notes.append(f"{OFF}: two programs publish one topic (`ros2 topic info -v` lists them: end one, and "
-                              "record again), or most samples were lost")
+            self.notes.append(f"{OFF}: {TWO_PROGRAMS}, or most samples were lost")
         return Recording(
             path=path,
             namespace=namespace,
@@ -507,19 +509,18 @@ class _Join:
             raise RecordingError(f"{series.topic}: header.stamp is never set, so its samples cannot be dated or "
                                  "joined: set it to the instant of each sample in the program that publishes them")
         rows = np.flatnonzero(understood)
-        sorted_stamps, first, group, times = np.unique(stamps[rows], return_index=True, return_inverse=True,
-                                                       return_counts=True)
+        sorted_stamps, first, times = np.unique(stamps[rows], return_index=True, return_counts=True)
         if len(times) and times.max() >= STANDS:
             self.notes.append(f"{int(times.max())} messages of {series.topic} have one stamp: the clock that stamps "
                               "them stands still; all but the first are left out")
-        self.duplicates += len(rows) - len(first)
-        kept = rows[first][group]
-        differs = np.any([(x[rows] != x[kept]) & np.isfinite(x[rows]) & np.isfinite(x[kept])
-                          for x in columns.values()], axis=0)
-        if apart := int(differs.sum()):
-            self.notes.append(f"{counted(apart, 'message')} of {series.topic} {_has(apart)} the stamp of another and "
-                              "other values: two programs publish it (`ros2 topic info -v` lists them: end one, and "
-                              "record again)")
+        if repeated := len(rows) - len(first):
+            self.duplicates += repeated
+            kept = rows[first][np.searchsorted(sorted_stamps, stamps[rows])]
+            differs = np.any([(x[rows] != x[kept]) & np.isfinite(x[rows]) & np.isfinite(x[kept])
+                              for x in columns.values()], axis=0)
+            if apart := int(differs.sum()):
+                self.notes.append(f"{counted(apart, 'message')} of {series.topic} {_has(apart)} the stamp of another "
+                                  f"and other values: {TWO_PROGRAMS}")
         rows = rows[first]
         received = np.array(series.times, dtype=np.int64)[rows]
         return _Table(sorted_stamps, received, {name: values[rows] for name, values in columns.items()})

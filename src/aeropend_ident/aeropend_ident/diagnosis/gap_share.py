@@ -254,9 +254,10 @@ def headline(parts: Sequence[Part], share: Mapping[str, Interval], material: flo
             ends of its part do not count.
     """
     named = sorted((p for p in parts if p.name), key=lambda p: -p.amount)
-    scatter, sure = shares(parts, shared=0.0, ends=False), shares(parts, ends=False)
+    scatter = shares(parts, shared=0.0, ends=False)
     likely = [p for p in named if p.name in share and share[p.name].value >= material
               and (p.name == UNKNOWN or scatter[p.name].low > 0.0)]
+    sure = shares(parts, ends=False) if len(likely) > 1 else {}
     claimed = [p for p in likely if p is likely[0] or p.name == UNKNOWN or sure[p.name].low >= SURELY * material]
     effects = _ids(p for p in claimed if p.name != UNKNOWN)
     small = [e for e in _ids(p for p in named if p not in claimed and p.name != UNKNOWN) if e not in effects]

@@ -68,7 +68,6 @@ class Watcher:
         places: state of each place.
         free_gap: [floors] RMS of measured minus free-running model by channel, over about the last second.
         fault: why the samples cannot be judged; "" if they can.
-        to_learn: [s] of motion that is needed before anything is judged.
     """
 
     def __init__(self, model: Model, mean_hours: float = 24.0, period: float = SAMPLE_PERIOD) -> None:
@@ -78,10 +77,15 @@ class Watcher:
         self.detector = Detector(bank, limit(mean_hours))
         self.places = {place: Place(STALE) for place in PLACES}
         self.free_gap = dict.fromkeys(CHANNELS, 0.0)
-        self.fault, self.to_learn = "no sample yet", LEARNS
+        self.fault = "no sample yet"
         self.breaks = 0
         self._duty = self._spread = 0.0
         self._epoch_ns = 0  # stamp at time 0 of the detector
+
+    @property
+    def to_learn(self) -> float:
+        """[s] Motion that is needed before anything is judged."""
+        return max(LEARNS - self.detector.learned, 0.0)
 
     @property
     def note(self) -> str:
@@ -129,7 +133,7 @@ class Watcher:
             self._epoch_ns = int(batch.stamps[-1]) - round(d.time * 1e9)
             if d.tick % JUDGED == 0:
                 found = d.judge()
-                self.fault, self.to_learn = "", max(LEARNS - d.learned, 0.0)
+                self.fault = ""
                 self._look()
         return residuals, found
 
