@@ -37,6 +37,7 @@ setup(
             "identify = aeropend_ident.commands.identify:main",
             "bench_test = aeropend_ident.commands.bench:main",
             "excitation_quality = aeropend_ident.commands.excitation_quality:main",
+            "design = aeropend_ident.commands.design:main",
             "isolate = aeropend_ident.commands.isolate:main",
             "step_response = aeropend_ident.commands.step_response:main",
             "doctor = aeropend_ident.commands.doctor:main",

@@ -14,6 +14,7 @@ from aeropend_ident.diagnosis import diagnosis
 from aeropend_ident.diagnosis.diagnosis import Settings, diagnose
 from aeropend_ident.diagnosis.free_run_gap import Gap
 from aeropend_ident.diagnosis.gap_share import Part
+from aeropend_ident.diagnosis.left_open import design_command
 from aeropend_ident.diagnosis.results import document, verdict_lines
 from aeropend_ident.diagnosis.validation import validate
 from aeropend_ident.signals.signals import from_arrays
@@ -256,6 +257,7 @@ def test_two_numbers_of_which_the_product_counts_are_not_separable():
     assert set(pair) == {"parameter_mismatch:L_over_J", "parameter_mismatch:k_thrust"}
     assert all(name in made.which.next_experiment.why for name in pair)
     assert any(line.startswith("  not separable") and pair[1] in line for line in verdict_lines(made))
+    assert design_command(made) == ""  # no signal tells them apart
 
 
 def test_what_the_catalogue_does_not_hold_is_unknown():

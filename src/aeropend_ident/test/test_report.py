@@ -397,7 +397,9 @@ def test_what_is_open(friction):
     assert "cannot separate coulomb_friction from quadratic_drag: either explains it" in page.text("main")
     assert "(coulomb_friction: probability > 99.9 %, gap after 1.2 %; quadratic_drag: " in page.text("main")
     assert "slow ramps tell them apart" in page.text("main")
-    assert page.text("main", "pre") == "excite --ros-args -p kind:=steps -p duration:=60 -p 'sequence:=[0.1, 0.2]'"
+    assert page.text("main", "pre") == (
+        "excite --ros-args -p kind:=steps -p duration:=60 -p 'sequence:=[0.1, 0.2]'"
+        "design --model bench --separate coulomb_friction quadratic_drag")
     assert "cannot separate" not in Page(rendered(friction, not_separable=[], next_experiment=None)).text("main")
 
 

@@ -55,8 +55,11 @@ SETTINGS = {
     "levels": Setting(_DEFAULT.levels, "intervals of latin_hypercube, stairs of staircase", low=2, high=1000),
     "rest": Setting(_DEFAULT.rest, "duty 0 after each hypercube, and after each lift of free_decay", "s", 0.0, 600.0),
     "duty": Setting(_DEFAULT.duty, "duty of hold and free_decay", low=-1.0, high=1.0),
-    "sequence": Setting(list(_DEFAULT.sequence), "duties of steps, repeated", low=-1.0, high=1.0),
+    "sequence": Setting(list(_DEFAULT.sequence), "duties of steps and holds, repeated", low=-1.0, high=1.0),
+    "holds": Setting(list(_DEFAULT.holds), "time of each duty of holds", "s", SAMPLE_PERIOD, LONGEST),
     "frequencies": Setting(list(_DEFAULT.frequencies), "of multisine", "Hz", 1e-4, 0.5 / SAMPLE_PERIOD),
+    "duty_rate": Setting(_DEFAULT.duty_rate, "greatest rate of the duty, of every kind; 0: it may jump", "1/s", 0.0,
+                         1e3),
 }
 
 USAGE = usage(
@@ -65,6 +68,7 @@ USAGE = usage(
     [
         "excite",
         "excite --ros-args -p duration:=30.0 -p seed:=3",
+        "excite --ros-args --params-file experiment.yaml",
         "excite --ros-args -p kind:=steps -p 'sequence:=[0.0, 0.3, 0.5]' -p hold_max:=4.0",
     ],
 )

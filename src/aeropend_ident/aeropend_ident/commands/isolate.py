@@ -23,13 +23,13 @@ from aeropend_ident.diagnosis.experiment_design import EXPERIMENTS
 from aeropend_ident.diagnosis.isolation.isolate import Isolation, Sensor, isolate
 from aeropend_ident.diagnosis.isolation.planned import PlanError, like, planned
 from aeropend_ident.diagnosis.report import isolation as page
-from aeropend_ident.diagnosis.report.number_format import quantity
+from aeropend_ident.diagnosis.report.number_format import plain_quantity
 from aeropend_ident.result_folder import OutputError
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import CHANNELS
 from aeropend_sim.cli.command import EXIT_CODES, Parser, between, entry_point, own
 from aeropend_sim.cli.progress import progress
-from aeropend_sim.model import effect_file
+from aeropend_sim.model import effect_file, excitation_file
 from aeropend_sim.model.effects import CATALOGUE, DEFINED
 from aeropend_sim.model.excitation import KINDS, LONGEST, Excitation
 from aeropend_sim.model.parameters import PRESETS, load
@@ -41,6 +41,7 @@ EXAMPLES = f"""examples:
   isolate --channels theta v_a                        only the angle and the voltage are measured
   isolate --channels theta                            the angle and the command alone
   isolate --experiment 7                              a signal that `diagnose` proposes, 1 to {len(EXPERIMENTS)}
+  isolate --signal experiment.yaml                    a signal that `design` wrote
   isolate my_bag --model my_rig.yaml                  the duty, the channels and the noise of a recording
   isolate --effects my_effects.yaml --forms           effects by formula, and other forms of effects, too
   isolate --size coulomb_friction=0.05                pairs at another size than the usual one
@@ -50,6 +51,9 @@ EXAMPLES = f"""examples:
 A size is the distance from the value at which the effect is absent. `not at all` means not up to ten usual sizes.
 
 {EXIT_CODES}"""
+
+LENGTH = 30.0
+"""[s] Length of a signal if none is given (choice)."""
 
 USUAL = 1.5
 """Factor on a smallest size from which a sensor matters (choice: less is hardly worth a sensor)."""
@@ -62,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(arguments)
     further = tuple(id_ for file in options.effects for id_ in effect_file.load(file))
     model = load(options.model)
-    sizes = dict(map(_size, options.size))
+    sizes = sizes_of(options.size)
     html = Path(options.html) if options.html else None
     if html is not None and html.exists() and not options.overwrite:
         raise OutputError(f"{html}: is there already; give another --html, or --overwrite to replace it")
@@ -109,8 +113,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--experiment", type=int, choices=range(1, len(EXPERIMENTS) + 1), metavar="N",
                         help=f"number of a signal that `diagnose` proposes, 1 to {len(EXPERIMENTS)}: "
                              + ", ".join(f"{k} {e.kind}" for k, e in enumerate(EXPERIMENTS, 1)))
-    parser.add_argument("--duration", type=between(5.0, LONGEST, "a time", "s"), default=30.0, metavar="S",
-                        help="length of the signal, s; default 30")
+    parser.add_argument("--signal", metavar="FILE", help="a signal that `design` wrote, or parameters of `excite`")
+    parser.add_argument("--duration", type=between(5.0, LONGEST, "a time", "s"), metavar="S",
+                        help=f"length of the signal, s; default {LENGTH:g}, or that of --signal")
     parser.add_argument("--duty-max", type=between(0.0, 1.0, "a duty"), metavar="X",
                         help="greatest duty of the signal; default that of `excite`")
     parser.add_argument("--seed", type=int, default=0, help="seed of the signal; default 0")
@@ -127,24 +132,43 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--html", metavar="FILE", help="write a page with the matrix of pairs")
     parser.add_argument("--overwrite", action="store_true", help="replace the file of --html")
     options = parser.parse_args(arguments)
-    if options.bag and (options.kind or options.experiment or options.duty_max is not None):
-        parser.error("a bag has its own duty: leave --kind, --experiment and --duty-max out")
-    if options.experiment and (options.kind or options.duty_max is not None):
-        parser.error("--experiment has its own signal: leave --kind and --duty-max out")
+    if options.bag and (options.kind or options.experiment or options.signal or options.duty_max is not None):
+        parser.error("a bag has its own duty: leave --kind, --experiment, --signal and --duty-max out")
+    for name in ("experiment", "signal"):
+        if getattr(options, name) and (options.kind or options.duty_max is not None):
+            parser.error(f"--{name} has its own signal: leave --kind and --duty-max out")
+    if options.experiment and options.signal:
+        parser.error("--experiment and --signal are two signals: give one")
     if options.jobs < 1:
         parser.error(f"--jobs {options.jobs}: give 1 or more")
     return options
 
 
 def _signal(options: argparse.Namespace) -> Excitation:
+    if options.signal:
+        signal = excitation_file.load(options.signal)
+        return signal if options.duration is None else replace(signal, duration=options.duration)
+    seconds = LENGTH if options.duration is None else options.duration
     if options.experiment:
-        return replace(EXPERIMENTS[options.experiment - 1], duration=options.duration, seed=options.seed)
-    signal = Excitation(options.kind or "latin_hypercube", options.duration, options.seed)
+        return replace(EXPERIMENTS[options.experiment - 1], duration=seconds, seed=options.seed)
+    signal = Excitation(options.kind or "latin_hypercube", seconds, options.seed)
     top = options.duty_max
     if top is None:
         return signal
     return replace(signal, duty_max=top, duty=min(signal.duty, top),
                    sequence=tuple(min(x, top) for x in signal.sequence))
+
+
+def sizes_of(texts: Sequence[str]) -> dict[str, float]:
+    """Effect -> size, of arguments `EFFECT=X`.
+
+    Args:
+        texts: the arguments.
+
+    Raises:
+        PlanError: no such effect, or no size.
+    """
+    return dict(map(_size, texts))
 
 
 def _size(text: str) -> tuple[str, float]:
@@ -177,8 +201,8 @@ def print_tables(found: Isolation) -> None:
         table.add_column(heading, justify="right")
     table.add_column("not told from, where it is just seen", overflow="fold")
     for e in found.effects:
-        sizes = ("not at all" if x is None else quantity(x, e.unit, 2) for x in (e.seen, e.named))
-        table.add_row(e.effect, e.place, *sizes, quantity(e.usual, e.unit, 2), ", ".join(e.rivals))
+        sizes = ("not at all" if x is None else plain_quantity(x, e.unit, 2) for x in (e.seen, e.named))
+        table.add_row(e.effect, e.place, *sizes, plain_quantity(e.usual, e.unit, 2), ", ".join(e.rivals))
     console.print(table)
     for line in lines(found):
         console.print(printable(line), markup=False, soft_wrap=True)
@@ -190,10 +214,10 @@ def lines(found: Isolation) -> list[str]:
     unit = {e.effect: e.unit for e in found.effects}
     for a in found.at_size:
         if a.rivals:
-            said.append(f"not told apart: {a.effect} of {quantity(a.size, unit[a.effect], 2)} from "
+            said.append(f"not told apart: {a.effect} of {plain_quantity(a.size, unit[a.effect], 2)} from "
                         + ", ".join(f"{r} ({100.0 * p:.0f} %)" for r, p in a.rivals.items()))
         elif not a.seen:
-            said.append(f"not seen: {a.effect} of {quantity(a.size, unit[a.effect], 2)}")
+            said.append(f"not seen: {a.effect} of {plain_quantity(a.size, unit[a.effect], 2)}")
     if not said:
         said.append("all effects of the given (else usual) sizes are seen, and told from all others")
     if blind := [e for e, s in found.structural.items() if not s.detectable]:

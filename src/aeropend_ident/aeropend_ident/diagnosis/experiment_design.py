@@ -151,7 +151,7 @@ def distances(model: Model, signals: Signals, first: Named, rivals: Sequence[Nam
         rivals: of it.
         excitation: the signal.
     """
-    planned = _Planned.of(model, signals, first[1], excitation)
+    planned = PlannedReadings.under(model, signals, excitation.series(), first[1])
     nominal = {n: NOMINAL_SD * abs(model.model[n]) for n in MODEL_NAMES if n in first[1] and model.model[n] != 0.0}
     at_first = planned.readings(first[1])
     slope_of = dict(zip(nominal, planned.slopes(first[1], at_first, nominal), strict=True))
@@ -171,8 +171,8 @@ def distances(model: Model, signals: Signals, first: Named, rivals: Sequence[Nam
 
 
 @dataclass(frozen=True)
-class _Planned:
-    """A recording that an excitation signal would give.
+class PlannedReadings:
+    """The readings of a recording that a duty signal would give.
 
     Attributes:
         model: the nominal model.
@@ -187,9 +187,16 @@ class _Planned:
     noise: Mapping[str, float]
 
     @classmethod
-    def of(cls, model: Model, signals: Signals, values: Mapping[str, float], excitation: Excitation) -> _Planned:
-        """Plan a recording with the channels and the noise of `signals`; `values` give the pulses of the speed."""
-        duty = excitation.series()
+    def under(cls, model: Model, signals: Signals, duty: Array, values: Mapping[str, float] | None = None
+              ) -> PlannedReadings:
+        """Plan a recording.
+
+        Args:
+            model: the nominal model.
+            signals: gives the channels and the noise.
+            duty: (N,) held for one `SAMPLE_PERIOD` each.
+            values: give the pulses of the speed.
+        """
         nothing = np.full(len(duty), np.nan)
         plan = replace(signals, period=SAMPLE_PERIOD, duty=duty, theta=nothing, omega=nothing, i_a=nothing,
                        v_a=nothing, pulses=None, false_speed=np.zeros(len(duty), dtype=bool), train=len(duty))
@@ -197,7 +204,7 @@ class _Planned:
         planned = cls(model, plan, shown, _noise(signals))
         if signals.pulses is not None:  # the speed is read once a pulse
             turn = 2.0 * math.pi / model.sensing["speed_pulses_per_rev"]
-            angle = np.cumsum(planned.run(values)["omega"]) * SAMPLE_PERIOD
+            angle = np.cumsum(planned.run(values or {})["omega"]) * SAMPLE_PERIOD
             shown["omega"] = np.flatnonzero(np.diff(np.floor(angle / turn)))
         return planned
 
@@ -207,7 +214,10 @@ class _Planned:
 
     def readings(self, values: Mapping[str, float]) -> Array:
         """(M,) All readings in units of their noise."""
-        run = self.run(values)
+        return self.stacked(self.run(values))
+
+    def stacked(self, run: Mapping[str, Array]) -> Array:
+        """(M,) All readings of a run, which may be longer, in units of their noise."""
         return finite(np.concatenate([run[c][at] / self.noise[c] for c, at in self.shown.items()]))
 
     def slopes(self, values: Mapping[str, float], here: Array, scales: Mapping[str, float]) -> Array:
@@ -228,7 +238,7 @@ class _Refit:
         scales: standard deviations of the P values.
     """
 
-    planned: _Planned
+    planned: PlannedReadings
     values: Mapping[str, float]
     here: Array
     rows: Array

@@ -27,6 +27,7 @@ from aeropend_ident.diagnosis.document import (
     VariantFound,
     to_json,
 )
+from aeropend_ident.diagnosis.left_open import design_command
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.diagnosis.report import changes, page, sentence
 from aeropend_ident.diagnosis.report.candidates import form_text, open_pairs, strength_text, unit_of
@@ -181,6 +182,8 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
     lines += [f"  not separable by this recording, either explains it: {' and '.join(pair)}" for pair in pairs]
     if pairs and which.next_experiment:
         lines.append(f"  next: {experiment(which.next_experiment)}")
+    if pairs and (command := design_command(document)):
+        lines.append(f"  an experiment within your limits that shows most of it: {command}")
     if document.identified is not None:
         lines.append(f"  {identified_line(document.identified, which.numbers, document.duration_s)}")
     lines += [variant_line(v) for v in document.variants or ()]

@@ -20,6 +20,7 @@ PURPOSES = {
         "watch": "run the model beside a rig and tell when they part",
         "doctor": "check the installation, recordings and model files",
         "isolate": "say before a recording which effects it would show",
+        "design": "find the signal that shows most, within limits",
         "excitation_quality": "check how well an input excites each term of the model",
         "precompile": "compile now what the first diagnosis would wait for",
     },

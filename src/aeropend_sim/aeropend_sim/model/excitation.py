@@ -32,8 +32,10 @@ class Excitation:
         levels: intervals of the Latin hypercube; stairs of staircase.
         rest: [s] time with duty 0 after each Latin hypercube and after each lift of free_decay.
         duty: duty of hold and free_decay, 0..1.
-        sequence: duties of steps, repeated, 0..1.
+        sequence: duties of steps and holds, repeated, 0..1.
+        holds: [s] time of each duty of holds.
         frequencies: [Hz] frequencies of multisine.
+        duty_rate: [1/s] greatest rate of the duty, of every kind; 0 = it may jump.
 
     Raises:
         UserError: the fields contradict each other.
@@ -50,7 +52,9 @@ class Excitation:
     rest: float = 3.0
     duty: float = 0.45
     sequence: tuple[float, ...] = (0.0, 0.4314)
+    holds: tuple[float, ...] = (2.0, 2.0)
     frequencies: tuple[float, ...] = (0.11, 0.23, 0.37, 0.61, 0.97, 1.57, 2.51, 4.07)
+    duty_rate: float = 0.0
 
     def __post_init__(self) -> None:
         nyquist = 0.5 / SAMPLE_PERIOD
@@ -77,6 +81,15 @@ class Excitation:
                 "sequence: give at least one duty, each -1 to 1",
             ),
             (
+                not self.holds or not all(SAMPLE_PERIOD <= hold <= LONGEST for hold in self.holds),
+                f"holds: give at least one time, each 0.00204 to {LONGEST:g} s",
+            ),
+            (
+                self.kind == "holds" and len(self.holds) != len(self.sequence),
+                f"sequence has {len(self.sequence)} duties and holds {len(self.holds)} times: give as many of each",
+            ),
+            (not self.duty_rate >= 0.0, f"duty_rate is {self.duty_rate:g}: give 0 or more"),
+            (
                 not self.frequencies or not all(0.0 < frequency < nyquist for frequency in self.frequencies),
                 f"frequencies: give at least one, each above 0 and below {nyquist:.0f} Hz",
             ),
@@ -86,7 +99,8 @@ class Excitation:
 
     def series(self) -> Array:
         """The duty (N,) at each sample, 0..1, held for one `SAMPLE_PERIOD`."""
-        return KINDS[self.kind](self)
+        series = KINDS[self.kind](self)
+        return _limited(series, self.duty_rate * SAMPLE_PERIOD) if self.duty_rate > 0.0 else series
 
     @property
     def samples(self) -> int:
@@ -100,6 +114,15 @@ def _held(holds: list[tuple[float, float]], samples: int) -> Array:
     ends = np.cumsum([seconds for _, seconds in holds])
     at = np.searchsorted(ends, (np.arange(samples) + 0.5) * SAMPLE_PERIOD)
     return duties[np.minimum(at, len(duties) - 1)]
+
+
+def _limited(series: Array, step: float) -> Array:
+    """A series that starts at 0 and changes by no more than a step from sample to sample."""
+    at, out = 0.0, []
+    for wanted in series.tolist():
+        at = min(max(wanted, at - step), at + step)
+        out.append(at)
+    return np.array(out)
 
 
 def latin_hypercube(x: Excitation) -> Array:
@@ -125,6 +148,12 @@ def steps(x: Excitation) -> Array:
     """The duties of `sequence`, each for `hold_max` seconds, repeated."""
     repeats = math.ceil(x.duration / (x.hold_max * len(x.sequence)))
     return _held([(duty, x.hold_max) for duty in x.sequence] * repeats, x.samples)
+
+
+def holds(x: Excitation) -> Array:
+    """Each duty of `sequence` for its time of `holds`, repeated: what `design` writes."""
+    both = list(zip(x.sequence, x.holds, strict=True))
+    return _held(both * math.ceil(x.duration / sum(x.holds)), x.samples)
 
 
 def staircase(x: Excitation) -> Array:
@@ -164,6 +193,6 @@ def hold(x: Excitation) -> Array:
 
 
 KINDS: dict[str, Callable[[Excitation], Array]] = {
-    function.__name__: function for function in (latin_hypercube, steps, staircase, multisine, free_decay, hold)
+    function.__name__: function for function in (latin_hypercube, steps, holds, staircase, multisine, free_decay, hold)
 }
 """All kinds of signal by name."""

@@ -15,6 +15,7 @@ from aeropend_ident.diagnosis.document import (
     Interval,
     NextExperiment,
 )
+from aeropend_ident.diagnosis.left_open import design_command
 from aeropend_ident.diagnosis.policy import CALIBRATED
 from aeropend_ident.diagnosis.report.number_format import interval, minus, percent, probability, quantity, with_unit
 from aeropend_ident.diagnosis.report.sentence import NONE, SAME_END
@@ -102,6 +103,7 @@ class Candidates:
         not_separable: pairs that concern the verdict.
         sets: the sets of effects of a stage that are likely, a list a stage.
         advice: the next experiment.
+        design: the command that designs one; "" if there is none.
     """
 
     shown: list[CandidateRow]
@@ -110,6 +112,7 @@ class Candidates:
     not_separable: list[OpenPair]
     sets: list[list[EffectSet]]
     advice: NextExperiment | None
+    design: str
 
 
 def unit_of(effect: str, parameter: str) -> str:
@@ -160,7 +163,8 @@ def section(document: DiagnosisDocument, candidates: list[CandidateRow]) -> Cand
         else "No effect was tried: refitted parameters leave too little of the gap.")
     pairs = [OpenPair(pair, _how_close(document, pair)) for pair in open_pairs(document)]
     sets = [list(of_stage) for _, of_stage in groupby(document.which.sets, lambda s: s.stage)]
-    return Candidates(shown, others, nothing, pairs, sets, document.which.next_experiment if pairs else None)
+    return Candidates(shown, others, nothing, pairs, sets, document.which.next_experiment if pairs else None,
+                      design_command(document) if pairs else "")
 
 
 def why_lost(document: DiagnosisDocument, c: Candidate) -> str:

@@ -50,6 +50,17 @@ def quantity(value: float | None, unit: str = "", digits: int = 3) -> str:
     return with_unit(fixed(x, exponent, digits - 1 - _magnitude(x) + exponent) + _power(exponent), unit)
 
 
+def plain_quantity(value: float | None, unit: str = "", digits: int = 3) -> str:
+    """As `quantity`, in plain characters, for a terminal.
+
+    Args:
+        value: in `unit`.
+        unit: of it.
+        digits: significant digits.
+    """
+    return quantity(value, unit, digits).replace("\N{NO-BREAK SPACE}", " ").replace("−", "-")
+
+
 def exact(value: float) -> str:
     """A number as it was given, to at most six digits: `43629`, `6.8 × 10⁻⁴`."""
     x = sane(value)

@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a verdict leaves open, as the question of the next experiment."""
+
+from dataclasses import replace
+
+import pytest
+
+from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.left_open import as_refitted, design_command, left_open
+from aeropend_ident.diagnosis.results import document, verdict_lines
+from aeropend_ident.signals.signals import from_arrays
+from aeropend_sim.model import rig
+from aeropend_sim.model.excitation import Excitation
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, load
+
+BENCH = load("bench")
+
+
+@pytest.fixture(scope="module")
+def lag():
+    """A short lag of the thrust, which one of the encoder imitates."""
+    duty = Excitation(duration=15.0, seed=4).series()
+    read, _ = rig.record(BENCH.with_effects({"thrust_lag": {"tau": 0.012}}), duty, 3)
+    found = diagnose(BENCH, [from_arrays({**read, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)])
+    return document(found, ["bag"], "bench", 1.0)
+
+
+@pytest.mark.promise("Verdict", "What is not separable comes with the command that designs an experiment for it")
+def test_what_is_not_separable_is_asked_next(lag):
+    open_ = left_open(lag)
+    assert set(open_.names) == {"thrust_lag", "encoder_lag"}
+    assert open_.sizes["thrust_lag"] == pytest.approx(0.012, rel=0.3)
+    command = design_command(lag)
+    assert command.startswith("design --model bench --separate ")
+    assert any(line.endswith(command) for line in verdict_lines(lag))
+
+
+def test_where_nothing_is_open_nothing_is_asked(lag):
+    closed = replace(lag, which=replace(lag.which, not_separable=()))
+    assert left_open(closed).names == ()
+    assert design_command(closed) == ""
+
+
+def test_an_experiment_is_designed_for_the_numbers_that_were_fitted(lag):
+    model = as_refitted(BENCH, lag)
+    assert model.model["k_thrust"] == lag.which.numbers["k_thrust"].value
+    assert model.sensing == BENCH.sensing
