@@ -38,6 +38,7 @@ setup(
             "bench_test = aeropend_ident.commands.bench:main",
             "excitation_quality = aeropend_ident.commands.excitation_quality:main",
             "design = aeropend_ident.commands.design:main",
+            "investigate = aeropend_ident.commands.investigate:main",
             "isolate = aeropend_ident.commands.isolate:main",
             "step_response = aeropend_ident.commands.step_response:main",
             "doctor = aeropend_ident.commands.doctor:main",

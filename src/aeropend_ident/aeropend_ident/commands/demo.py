@@ -9,41 +9,25 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from aeropend_ident.commands.programs import MODULES, ProgramError, environment, made, process, record_excited
 from aeropend_ident.diagnosis import document
 from aeropend_ident.diagnosis.document import DiagnosisDocument
 from aeropend_sim.cli.command import Parser, entry_point
-from aeropend_sim.errors import UserError
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import Model, load, save
 
 NUMBER_ERROR = 0.03
 """Each number of the plant is off from the model by up to this share: no model's numbers are exact."""
-
-STARTUP = 30.0
-"""s that processes may take to find each other."""
-
-MODULES = {"plant": "aeropend_sim.nodes.plant", "excite": "aeropend_control.nodes.excite",
-           "record": "aeropend_ident.nodes.record", "diagnose": "aeropend_ident.commands.diagnose",
-           "controller": "aeropend_control.nodes.controller", "reference": "aeropend_control.nodes.reference",
-           "watch": "aeropend_ident.nodes.watch"}
-
-
-class DemoError(UserError):
-    """The demo cannot go on; the message is one line for a person."""
 
 
 def draw(effect: str | None, seed: int | None) -> tuple[str, Model]:
@@ -69,76 +53,13 @@ def draw(effect: str | None, seed: int | None) -> tuple[str, Model]:
     return drawn, Model("rig", numbers, bench.sensing, effects)
 
 
-@contextmanager
-def process(name: str, *arguments: str, environment: dict[str, str], log: Path) -> Iterator[subprocess.Popen[str]]:
-    """A program of ours, its output in a file; stopped when the block is left, whatever happens."""
-    with log.open("w", encoding="utf-8") as file:
-        child = subprocess.Popen([sys.executable, "-m", MODULES[name], *arguments], env=environment, stdout=file,
-                                 stderr=subprocess.STDOUT, text=True, start_new_session=True)
-        try:
-            yield child
-        finally:
-            for number, patience in ((signal.SIGINT, 10.0), (signal.SIGKILL, 5.0)):
-                if child.poll() is None:
-                    child.send_signal(number)
-                    try:
-                        child.wait(patience)
-                    except subprocess.TimeoutExpired:
-                        continue
-
-
-def check(name: str, child: subprocess.Popen[str], log: Path) -> None:
-    """Raise a DemoError if a program has ended with an error."""
-    if child.poll() not in (None, 0):
-        lines = log.read_text(encoding="utf-8").strip().splitlines()
-        raise DemoError(f"{name} ended with {child.returncode}: {lines[-1] if lines else 'no output'} (see {log})")
-
-
-def made(folder: Path) -> None:
-    """Make the folder for everything, which must be new."""
-    try:
-        folder.mkdir(parents=True)
-    except OSError as error:
-        raise DemoError(f"{folder}: {error.strerror}; give a new folder with --out") from None
-
-
-def environment() -> dict[str, str]:
-    """Environment of the programs: a graph of their own on this machine, unless the caller has chosen one."""
-    own = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    own.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    own.setdefault("ROS_DOMAIN_ID", str(os.getpid() % 100 + 1))
-    return own
-
-
 def measure(folder: Path, rig: Path, duration: float, seed: int, console: Console) -> Path:
     """Run the plant, excite it and record it, for `duration` seconds; returns the recording."""
-    bag = folder / "recording"
-    own = environment()
-    logs = {name: folder / f"{name}.log" for name in MODULES}
-
-    def start(name: str, *arguments: str):  # type: ignore[no-untyped-def]
-        return process(name, *arguments, environment=own, log=logs[name])
-
-    with (
-        Progress(TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), console=console) as bar,
-        start("plant", "--ros-args", "--params-file", str(rig), "-p", f"seed:={seed}") as plant,
-        start("record", str(bag), "--ros-args", "-p", "while_published:=duty_command") as record,
-        start("excite", "--ros-args", "-p", f"duration:={duration}", "-p", f"seed:={seed}") as excite,
-    ):
-        running = {"plant": plant, "record": record, "excite": excite}
-        task = bar.add_task("plant, excite and record are running", total=duration)
-        begun = time.monotonic()
-        while record.poll() is None:
-            for name, child in running.items():
-                check(name, child, logs[name])
-            passed = time.monotonic() - begun
-            if passed > duration + STARTUP:
-                raise DemoError(f"the recording did not end {STARTUP:g} s after it should have (see {logs['record']})")
-            bar.update(task, completed=min(passed, duration))
-            time.sleep(0.1)
-        bar.update(task, completed=duration)
-        for name, child in running.items():
-            check(name, child, logs[name])
+    bag, own, log = folder / "recording", environment(), folder / "plant.log"
+    with process("plant", "--ros-args", "--params-file", str(rig), "-p", f"seed:={seed}", environment=own,
+                 log=log) as plant:
+        record_excited(bag, ["-p", f"duration:={duration}", "-p", f"seed:={seed}"], duration, environment=own,
+                       others={"plant": plant}, console=console)
     return bag
 
 
@@ -147,7 +68,7 @@ def diagnose(folder: Path, bag: Path) -> DiagnosisDocument:
     result = subprocess.run([sys.executable, "-m", MODULES["diagnose"], str(bag), "--out", str(folder / "diagnosis")],
                             check=False)
     if result.returncode:
-        raise DemoError(f"diagnose ended with {result.returncode}")
+        raise ProgramError(f"diagnose ended with {result.returncode}")
     return document.read(folder / "diagnosis" / "diagnosis.json")
 
 

@@ -72,14 +72,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = own(arguments)
     options = parse(arguments)
     further = tuple(id_ for file in options.effects for id_ in effect_file.load(file))
-    limits = Limits((options.theta[0], options.theta[1]), options.speed, options.current,
-                    (options.duty[0], options.duty[1]), options.duty_rate)
+    limits = limits_of(options)
     out = Path(options.out)
     html = Path(options.html) if options.html else None
     for file in (out, html):
         if file is not None and file.exists() and not options.overwrite:
             raise OutputError(f"{file}: is there already; give another name, or --overwrite to replace it")
-    model, sizes, open_ = load(options.model), sizes_of(options.size), Open((), {})
+    model, sizes, open_ = load(options.model), sizes_of(options.size), Open((), {}, 0.0)
     if options.verdict:
         found = document.read(Path(options.verdict) / "diagnosis.json")
         model, open_ = as_refitted(model, found), left_open(found)
@@ -142,15 +141,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
                         help=f"length, s; default {LENGTH:g}")
     length.add_argument("--shortest", action="store_true",
                         help="the shortest length with which all that is asked is told apart")
-    default = Limits()
-    parser.add_argument("--theta", nargs=2, type=float, default=list(default.theta), metavar=("MIN", "MAX"),
-                        help="limits of the angle, rad; default ±π/2")
-    parser.add_argument("--speed", type=float, default=math.inf, metavar="X", help="limit of the rotor's speed, rad/s")
-    parser.add_argument("--current", type=float, default=math.inf, metavar="X", help="limit of the current, A")
-    parser.add_argument("--duty", nargs=2, type=float, default=list(default.duty), metavar=("MIN", "MAX"),
-                        help="limits of the duty; default {:g} {:g}".format(*default.duty))
-    parser.add_argument("--duty-rate", type=float, default=0.0, metavar="X",
-                        help="limit of the duty's rate, 1/s; default 0: it may jump")
+    add_limits(parser)
     parser.add_argument("--size", action="append", default=[], metavar="EFFECT=X",
                         help="size of an effect, in its unit (default: its usual size); may be given several times")
     parser.add_argument("--effects", action="append", default=[], metavar="FILE",
@@ -175,6 +166,36 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     if options.seed < 0:
         parser.error(f"--seed {options.seed}: give 0 or more")
     return options
+
+
+def add_limits(parser: argparse.ArgumentParser) -> None:
+    """Add the options of limits to a command line.
+
+    Args:
+        parser: of the command.
+    """
+    default = Limits()
+    parser.add_argument("--theta", nargs=2, type=float, default=list(default.theta), metavar=("MIN", "MAX"),
+                        help="limits of the angle, rad; default ±π/2")
+    parser.add_argument("--speed", type=float, default=math.inf, metavar="X", help="limit of the rotor's speed, rad/s")
+    parser.add_argument("--current", type=float, default=math.inf, metavar="X", help="limit of the current, A")
+    parser.add_argument("--duty", nargs=2, type=float, default=list(default.duty), metavar=("MIN", "MAX"),
+                        help="limits of the duty; default {:g} {:g}".format(*default.duty))
+    parser.add_argument("--duty-rate", type=float, default=0.0, metavar="X",
+                        help="limit of the duty's rate, 1/s; default 0: it may jump")
+
+
+def limits_of(options: argparse.Namespace) -> Limits:
+    """The limits that a command line gives.
+
+    Args:
+        options: with those of `add_limits`.
+
+    Raises:
+        LimitError: they make no sense.
+    """
+    return Limits((options.theta[0], options.theta[1]), options.speed, options.current,
+                  (options.duty[0], options.duty[1]), options.duty_rate)
 
 
 def reach_lines(best: Designed) -> Iterator[str]:

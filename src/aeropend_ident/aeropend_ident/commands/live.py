@@ -24,7 +24,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 from std_msgs.msg import Float64
 
-from aeropend_ident.commands.demo import check, environment, made, process
+from aeropend_ident.commands.programs import check, environment, made, process
 from aeropend_sim.cli.command import Parser, entry_point
 from aeropend_sim.model import effect_file
 from aeropend_sim.model.effects import CATALOGUE

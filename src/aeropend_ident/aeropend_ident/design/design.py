@@ -120,6 +120,24 @@ def design(rows: Rows, goal: Goal, limits: Limits, seconds: float | None = None,
                     begun[before].answers if before else ())
 
 
+def prolonged(rows: Rows, goal: Goal, best: Designed, times: int) -> Designed:
+    """An experiment that is repeated; its duties are lowered if an arm that already moves would cross a limit.
+
+    Args:
+        rows: of the rig.
+        goal: of the experiment.
+        best: the experiment.
+        times: that it is played.
+    """
+    exchange = Exchange(rows, goal, best.limits)
+    x = best.excitation
+    within = exchange.within(Holds(x.sequence * times, x.holds * times, x.duty_rate))
+    if within is None:
+        return best
+    safe = _checked(exchange, within, 0)
+    return replace(best, excitation=safe.holds.excitation, answers=safe.answers, reach=safe.reach)
+
+
 def _checked(exchange: Exchange, best: Tried, seed: int) -> Tried:
     """A signal with its duties lowered until no drawn rig crosses a limit."""
     rows, limits, factor = exchange.rows, exchange.limits, 1.0

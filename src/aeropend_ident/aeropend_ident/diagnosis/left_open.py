@@ -19,10 +19,12 @@ class Open:
     Attributes:
         names: of the hypotheses that are not told apart; none: nothing certain is known, or nothing is open.
         sizes: effect -> its size in the verdict, as a distance from the neutral one.
+        rival: probability of the likeliest of them that is not the first.
     """
 
     names: tuple[str, ...]
     sizes: Mapping[str, float]
+    rival: float
 
 
 def left_open(document: DiagnosisDocument) -> Open:
@@ -46,7 +48,8 @@ def left_open(document: DiagnosisDocument) -> Open:
             neutral = DEFINED[c.effect].parameters[size].neutral
             if size in c.parameters and c.parameters[size].value != neutral:
                 sizes[c.effect] = abs(c.parameters[size].value - neutral)
-    return Open(tuple(names) if len(names) > 1 else (), sizes)
+    likely = sorted((c.probability for c in which.candidates if _name(c) in names), reverse=True)
+    return Open(tuple(names), sizes, likely[1]) if len(likely) > 1 else Open((), {}, 0.0)
 
 
 def as_refitted(model: Model, document: DiagnosisDocument) -> Model:

@@ -142,8 +142,13 @@ def _notes(recordings: Sequence[Signals], bags: Sequence[str]) -> Iterator[str]:
         yield from (f"{bag}: {note}" if len(bags) > 1 else note for note in s.notes)
 
 
-def verdict_lines(document: DiagnosisDocument) -> list[str]:
-    """The verdict in a few lines for the terminal."""
+def verdict_lines(document: DiagnosisDocument, *, advice: bool = True) -> list[str]:
+    """The verdict in a few lines for the terminal.
+
+    Args:
+        document: of the diagnosis.
+        advice: whether to say what to record next.
+    """
     which, closure = document.which, document.closure
     headline = "".join(part.text for part in sentence.verdict(document))
     why = "; ".join(which.unexplained)
@@ -152,7 +157,7 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
         lines.append(changes.verdict_line(document.since, document.where.place))
     elif which.verdict == "none":
         lines.append(f"verdict: none. {_spaced(headline)}")
-        if document.identified is None and len(document.bags) == 1:
+        if advice and document.identified is None and len(document.bags) == 1:
             words = shlex.join(["isolate", *document.bags, "--model", document.model])
             lines.append(f"  how small an effect would still show in it: {words}")
     elif which.verdict == CANNOT_TELL:
@@ -180,9 +185,9 @@ def verdict_lines(document: DiagnosisDocument) -> list[str]:
         lines.append(f"  not claimed: {'; '.join(small)}")
     pairs = open_pairs(document)
     lines += [f"  not separable by this recording, either explains it: {' and '.join(pair)}" for pair in pairs]
-    if pairs and which.next_experiment:
+    if advice and pairs and which.next_experiment:
         lines.append(f"  next: {experiment(which.next_experiment)}")
-    if pairs and (command := design_command(document)):
+    if advice and pairs and (command := design_command(document)):
         lines.append(f"  an experiment within your limits that shows most of it: {command}")
     if document.identified is not None:
         lines.append(f"  {identified_line(document.identified, which.numbers, document.duration_s)}")

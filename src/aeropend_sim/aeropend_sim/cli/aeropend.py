@@ -21,6 +21,7 @@ PURPOSES = {
         "doctor": "check the installation, recordings and model files",
         "isolate": "say before a recording which effects it would show",
         "design": "find the signal that shows most, within limits",
+        "investigate": "run experiments on a rig until the verdict is sure",
         "excitation_quality": "check how well an input excites each term of the model",
         "precompile": "compile now what the first diagnosis would wait for",
     },

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Experiments one after another, on simulated rigs: when they end, and with what verdict."""
+
+import pytest
+
+from aeropend_ident.commands.investigate import main
+from aeropend_ident.design.investigation import LENGTH, Investigation
+from aeropend_ident.design.limits import Limits
+from aeropend_ident.diagnosis.isolation.planned import planned
+from aeropend_ident.diagnosis.results import document
+from aeropend_ident.signals.signals import from_arrays
+from aeropend_sim.model import rig
+from aeropend_sim.model.excitation import Excitation
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, load
+
+BENCH = load("bench")
+LIMITS = Limits(theta=(-0.8, 1.2))
+
+
+def investigated(effects, most, seed=5):
+    """The inquiry on a rig with some effects, played on the simulated rig, and its verdicts."""
+    signals = planned(BENCH, Excitation(duration=10.0).series())
+    inquiry, verdicts = Investigation(BENCH, signals, LIMITS, most, tries=24, jobs=2), []
+    while (proposal := inquiry.next()) is not None:
+        duty = proposal.designed.excitation.series()
+        read, truth = rig.record(BENCH.with_effects(effects), duty, seed + len(verdicts))
+        assert LIMITS.theta[0] < truth["theta"].min()
+        assert truth["theta"].max() < LIMITS.theta[1]
+        recording = from_arrays({**read, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)
+        found = inquiry.add(recording, lambda d: document(d, ["bag"] * (len(verdicts) + 1), "bench", 1.0))
+        verdicts.append(found.conclusions.which)
+    return inquiry, verdicts
+
+
+@pytest.mark.promise("Verdict", "`investigate` makes one experiment after another until the verdict is sure")
+def test_a_clear_effect_needs_one_experiment():
+    inquiry, verdicts = investigated({"coulomb_friction": {"accel": 0.4}}, 120.0)
+    assert [w.verdict for w in verdicts] == ["coulomb_friction"]
+    assert inquiry.sure
+    assert inquiry.moved == pytest.approx(LENGTH, abs=0.1)
+
+
+def test_what_one_experiment_leaves_open_another_one_is_for():
+    inquiry, verdicts = investigated({"cable_torque": {"k": 0.25, "theta0": 0.4}}, 120.0)
+    assert verdicts[0].not_separable
+    assert len(verdicts) > 1
+    assert inquiry.sure
+    assert verdicts[-1].verdict == "cable_torque"
+
+
+def test_it_ends_when_the_time_is_over():
+    inquiry, verdicts = investigated({"thrust_lag": {"tau": 0.008}}, 30.0)
+    assert len(verdicts) == 1
+    assert not inquiry.sure
+    assert "apart" in inquiry.ended or "not sure after 20 s" in inquiry.ended
+
+
+def test_without_a_terminal_nobody_can_agree(capsys, monkeypatch):
+    monkeypatch.setattr("sys.stdin.isatty", lambda: False)
+    assert main([]) == 2
+    assert "give --yes" in capsys.readouterr().err
