@@ -7,6 +7,7 @@
     make blind ARGS="--circumstances --count 100"   rigs as they are: many imperfections, feedback, lost samples
     make blind ARGS="--without --count 60"          what the catalogue does not hold: flagged, placed, learned
     make blind ARGS="--forms --count 60"            effects that follow another law than the catalogue has
+    make blind ARGS="--sequential --count 60"       experiments by design: limits, pairs, one after another
     make blind ARGS=--docs                          the table of the last run goes into docs/results/blind.md
 
 Steps can be run alone: --steps make,diagnose,peers,score. The labels stay sealed until every verdict is written.
@@ -41,6 +42,7 @@ from evaluation.blind import (
     plant,
     report,
     score,
+    sequential,
     uncalibrated,
 )
 
@@ -154,6 +156,8 @@ def main() -> None:
     parser.add_argument("--without", action="store_true",
                         help="open set: effects outside the catalogue, and each effect of it left out of the catalogue")
     parser.add_argument("--forms", action="store_true", help="effects that follow another law than docs/effects.md has")
+    parser.add_argument("--sequential", action="store_true",
+                        help="experiments by design: limits, pairs of effects, and one experiment after another")
     parser.add_argument("--docs", action="store_true",
                         help="run nothing, write the table of the last run into docs/results")
     options = parser.parse_args()
@@ -163,12 +167,13 @@ def main() -> None:
                       ("circumstances", "circumstances") if options.circumstances else
                       ("pairs", "pairs") if options.pairs else
                       ("open_set", "open_set") if options.without else
-                      ("forms", "forms") if options.forms else ("", "blind"))
+                      ("forms", "forms") if options.forms else
+                      ("sequential", "design") if options.sequential else ("", "blind"))
         page.write(options.out / part, name)
         return
-    if options.pairs or options.without or options.forms:
+    if options.pairs or options.without or options.forms or options.sequential:
         name, report_ = (("pairs", pairs.report) if options.pairs else ("open_set", open_set.report) if options.without
-                         else ("forms", forms.report))
+                         else ("forms", forms.report) if options.forms else ("sequential", sequential.report))
         out = options.out / name
         out.mkdir(parents=True, exist_ok=True)
         _save(out, report_(options.count, options.seed, options.duration, options.jobs), options)

@@ -153,6 +153,22 @@ def isolate(draw: Draw, bags: Sequence[Path], files: Path) -> list[str]:
             *draw.option(0.15, "--effects", [str(files / "effects.yaml")])]
 
 
+def design(draw: Draw, bags: Sequence[Path], files: Path) -> list[str]:
+    """A recording whose channels and noise are taken, with any limits."""
+    numbers = ["0.5", "1", "2", "5", "nan", "-0.2", "1e300", "x"]
+    pairs = [word for name in ("--theta", "--duty") if draw.chance(0.3)
+             for word in (name, draw.pick("-1", "-0.2", "0", "nan"), draw.pick("1", "0.5", "0.01", "x"))]
+    length = draw.option(0.1, "--duration", numbers) or ["--duration", "5"]
+    return [str(bags[0]), "--tries", "2", "--jobs", "1", *length,
+            *model(draw, files, 0.3), *pairs,
+            *(word for name in ("--speed", "--current", "--duty-rate") for word in draw.option(0.1, name, numbers)),
+            *draw.option(0.4, "--separate", ["thrust_lag", "gust", "parameter_mismatch:K_t", "mast_flex", "x"]),
+            *draw.option(0.1, "--fix", ["K_t", "k0", "R_a"]), *draw.some(0.3, "--json"), *draw.some(0.3, "--overwrite"),
+            *draw.option(0.3, "--size", ["brush_drop=0.1", "brush_drop=nan", "thrust_lag=1e300", "thrust_lag=1e-9"]),
+            *draw.option(0.3, "--html", ["page.html", "nowhere/page.html"]),
+            *draw.option(0.15, "--effects", [str(files / "effects.yaml")])]
+
+
 def import_(draw: Draw, bags: Sequence[Path], files: Path) -> list[str]:
     """A recording, or a table of one, with any options."""
     if draw.chance(0.35):
@@ -267,6 +283,7 @@ COMMANDS = {
     "recover": Command(f"{_COMMANDS}.recover", recover),
     "excitation_quality": Command(f"{_COMMANDS}.excitation_quality", excitation_quality, mildness=0.65,
                                   first=()),
+    "design": Command(f"{_COMMANDS}.design", design, mildness=0.65, longest=20.0),
     "isolate": Command(f"{_COMMANDS}.isolate", isolate, mildness=0.65, longest=20.0),
     "import": Command(f"{_COMMANDS}.import_table", import_),
     "doctor": Command(f"{_COMMANDS}.doctor", doctor, mildness=0.65, several=0.4, first=()),

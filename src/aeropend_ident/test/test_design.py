@@ -159,7 +159,7 @@ def test_the_command_writes_a_signal_that_excite_plays(tmp_path, capsys):
     assert main(arguments) == 0
     said = capsys.readouterr()
     assert "thrust_lag" in said.out
-    assert "mine.yaml: play it with" in said.err
+    assert "mine.yaml: play it with" in said.out
     signal = excitation_file.load(out)
     assert signal.kind == "holds"
     assert signal.duration == 6.0

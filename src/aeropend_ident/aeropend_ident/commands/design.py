@@ -104,8 +104,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(json.dumps(typed_json.to_json(best), indent=1, ensure_ascii=False))
     else:
         print_tables(best)
-    print(printable(f"{out}: play it with {called('excite', 'aeropend_control')} --ros-args --params-file "
-                    f"{shlex.quote(str(out))}"), file=sys.stderr)
+        print(printable(f"{out}: play it with {called('excite', 'aeropend_control')} --ros-args --params-file "
+                        f"{shlex.quote(str(out))}"))
     return 0
 
 
@@ -175,13 +175,15 @@ def add_limits(parser: argparse.ArgumentParser) -> None:
         parser: of the command.
     """
     default = Limits()
-    parser.add_argument("--theta", nargs=2, type=float, default=list(default.theta), metavar=("MIN", "MAX"),
-                        help="limits of the angle, rad; default ±π/2")
-    parser.add_argument("--speed", type=float, default=math.inf, metavar="X", help="limit of the rotor's speed, rad/s")
-    parser.add_argument("--current", type=float, default=math.inf, metavar="X", help="limit of the current, A")
-    parser.add_argument("--duty", nargs=2, type=float, default=list(default.duty), metavar=("MIN", "MAX"),
-                        help="limits of the duty; default {:g} {:g}".format(*default.duty))
-    parser.add_argument("--duty-rate", type=float, default=0.0, metavar="X",
+    parser.add_argument("--theta", nargs=2, type=within(-10.0, 10.0, "an angle", "rad"), default=list(default.theta),
+                        metavar=("MIN", "MAX"), help="limits of the angle, rad; default ±π/2")
+    parser.add_argument("--speed", type=within(0.0, 1e5, "a speed", "rad/s"), default=math.inf, metavar="X",
+                        help="limit of the rotor's speed, rad/s")
+    parser.add_argument("--current", type=within(0.0, 1e4, "a current", "A"), default=math.inf, metavar="X",
+                        help="limit of the current, A")
+    parser.add_argument("--duty", nargs=2, type=within(-1.0, 1.0, "a duty"), default=list(default.duty),
+                        metavar=("MIN", "MAX"), help="limits of the duty; default {:g} {:g}".format(*default.duty))
+    parser.add_argument("--duty-rate", type=within(0.0, 1e3, "a rate", "1/s"), default=0.0, metavar="X",
                         help="limit of the duty's rate, 1/s; default 0: it may jump")
 
 

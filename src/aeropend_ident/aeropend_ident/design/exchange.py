@@ -8,6 +8,7 @@ The coordinate and its new value are drawn, since each evaluation simulates all 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -149,8 +150,8 @@ class Tried:
 
     Attributes:
         holds: the signal.
-        score: of its goal.
-        answers: to what is asked.
+        score: of its goal; of a signal beyond a limit minus infinity.
+        answers: to what is asked; of a signal beyond a limit none.
         reach: what the channels reach at most.
         excess: by what share of its limit the worst channel is beyond it.
     """
@@ -183,8 +184,11 @@ class Exchange:
     def tried(self, holds: Holds) -> Tried:
         """Simulate a signal."""
         under = self.rows.under(holds.excitation.series())
+        excess = self.limits.excess(under.reach)
+        if not excess <= 0.0:
+            return Tried(holds, -math.inf, (), under.reach, excess)
         answers = self.goal.answers(under.products)
-        return Tried(holds, score(answers), answers, under.reach, self.limits.excess(under.reach))
+        return Tried(holds, score(answers), answers, under.reach, excess)
 
     def within(self, holds: Holds) -> Tried | None:
         """A signal with the largest duties that keep the limits; None: with none."""

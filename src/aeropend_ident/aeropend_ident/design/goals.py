@@ -104,13 +104,12 @@ class Separate:
                 sd[self.rows.index(rival)] = max(sd[self.rows.index(rival)], self.rows.wide(rival))
                 own = self.rows.further.get(rival, ())
                 used, sd = used + list(own), np.concatenate([sd, np.ones(len(own))])
-            information = products[np.ix_(used, used)] + np.diag(1.0 / sd**2)
-            variance = np.diag(np.linalg.inv(information))
+            known = _known(products[np.ix_(used, used)], sd)
             for effect in (e for e, r in self.pairs if r == rival):
                 k = self.rows.index(effect)
-                left = 1.0 / variance[k] - 1.0 / sd[k] ** 2
+                left = (1.0 / known[k] - 1.0) / sd[k] ** 2
                 unit = self.rows.wide(effect) if ":" in effect else 1.0
-                found[effect, rival] = unit * math.sqrt(max(float(left), 0.0))
+                found[effect, rival] = unit * math.sqrt(left)
         return found
 
     def answers(self, products: Array) -> tuple[Answer, ...]:
@@ -137,9 +136,19 @@ class Numbers:
     def answers(self, products: Array) -> tuple[Answer, ...]:
         """Each number, with the factor by which its standard deviation shrinks."""
         count = len(self.rows.background)
-        information = products[:count, :count] + np.diag(1.0 / self.rows.background**2)
-        sd = np.sqrt(np.diag(np.linalg.inv(information)))
-        return tuple(Answer(n, "", float(1.0 / sd[self.rows.index(n)]), SHARPER) for n in self.names)
+        known = _known(products[:count, :count], self.rows.background)
+        return tuple(Answer(n, "", float(1.0 / math.sqrt(known[self.rows.index(n)])), SHARPER) for n in self.names)
+
+
+def _known(products: Array, sd: Array) -> Array:
+    """(K,) Variance of each value after the recording, over that before it.
+
+    Args:
+        products: (K, K) of the rows.
+        sd: (K,) standard deviations before it.
+    """
+    information = np.eye(len(sd)) + products * sd[:, None] * sd[None, :]
+    return np.clip(np.diag(np.linalg.inv(information)), np.finfo(float).tiny, 1.0)
 
 
 def any_effect(rows: Rows, rivals: Sequence[str]) -> Separate:

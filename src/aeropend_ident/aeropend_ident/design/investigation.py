@@ -58,13 +58,14 @@ class Investigation:
         most: [s] motion in all.
         further: ids of effects of effect files.
         tries: signals that are tried for one experiment; None: the usual number.
+        first: the first experiment, if it is designed already.
         jobs: threads.
     """
 
     def __init__(self, model: Model, signals: Signals, limits: Limits, most: float, *, further: Sequence[str] = (),
-                 tries: int | None = None, jobs: int = 1) -> None:
+                 tries: int | None = None, first: Designed | None = None, jobs: int = 1) -> None:
         self.model, self.signals, self.limits, self.most = model, signals, limits, most
-        self.further, self.tries, self.jobs = tuple(further), tries, jobs
+        self.further, self.tries, self.first, self.jobs = tuple(further), tries, first, jobs
         self.recordings: list[Signals] = []
         self.moved = 0.0
         self.ended = ""
@@ -88,8 +89,9 @@ class Investigation:
         effects = asked(model, self.further, self._open.sizes)
         rows = Rows(model, self.signals, effects)
         goal = between(rows, names) if names else any_effect(rows, list(rows.effects))
-        best = design(rows, goal, self.limits, LENGTH, tries=self.tries, seed=len(self.recordings), jobs=self.jobs,
-                      progress=progress)
+        best = self.first if self.first is not None and not self.recordings else design(
+            rows, goal, self.limits, LENGTH, tries=self.tries, seed=len(self.recordings), jobs=self.jobs,
+            progress=progress)
         if not names:
             return Proposal(best, rows, "show any effect, and tell it from the others")
         reached = min(a.reached for a in best.answers)

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.design.limits import Ranges, reach_of
+from aeropend_ident.design.limits import LimitError, Ranges, reach_of
 from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD, SIZE_SD, TOLERANCE, usual_size
 from aeropend_ident.diagnosis.experiment_design import PlannedReadings
 from aeropend_ident.diagnosis.free_run_gap import free_run
@@ -64,6 +65,9 @@ def asked(model: Model, further: Sequence[str] = (), sizes: Mapping[str, float] 
         model: the nominal model.
         further: ids of effects of effect files.
         sizes: effect -> size, as a distance from the neutral one.
+
+    Raises:
+        LimitError: a size beyond the range of the effect.
     """
     found = {}
     for h in hypotheses(model, further):
@@ -75,6 +79,9 @@ def asked(model: Model, further: Sequence[str] = (), sizes: Mapping[str, float] 
             neutral = effect.parameters[effect.size].neutral
             usual = usual_size(h.effect, model) - neutral
             size = float(np.copysign((sizes or {}).get(h.effect, abs(usual)), usual))
+            if not h.own[0].low <= neutral + size <= h.own[0].high:
+                most = (h.own[0].high - neutral) if usual > 0.0 else (neutral - h.own[0].low)
+                raise LimitError(f"{h.effect} of {abs(size):g} is no size that it may have: give at most {most:g}")
             values = {**own, h.own[0].name: neutral + size}
             found[h.name] = Asked(h.name, size, values, tuple(p for p in h.own[1:]))
     return found
@@ -138,8 +145,7 @@ class Rows:
             for p in e.further:
                 moved = free_run(self.model, whole, {**e.values, p.name: _varied(p, e.values[p.name])})
                 rows.append((planned.stacked(moved) - with_[name]) / STEP)
-        stacked = np.array(rows, dtype=np.float32)
-        return Responses(np.asarray(stacked @ stacked.T, dtype=float), reach)
+        return Responses(np.array(rows), reach)
 
     def band(self, signals: Signals) -> tuple[Readings, Readings]:
         """The nominal readings under a duty signal, and how far numbers in their tolerance move them, to first order.
@@ -161,12 +167,17 @@ class Responses:
     """What a duty signal shows.
 
     Attributes:
-        products: (R, R) of the rows.
+        rows: (R, M) changes of the readings.
         reach: what the channels reach at most, on any rig within the uncertainty, to the first order.
     """
 
-    products: Array
+    rows: Array
     reach: Ranges
+
+    @cached_property
+    def products(self) -> Array:
+        """(R, R) of the rows."""
+        return np.asarray(self.rows @ self.rows.T)
 
 
 def after(signals: Signals, duty: Array, tail: float = TAIL) -> Signals:
