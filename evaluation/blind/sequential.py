@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.design.design import DURATIONS, Designed, design, starts
 from aeropend_ident.design.exchange import Exchange
 from aeropend_ident.design.goals import APART, NOTHING, Separate, any_effect, between
@@ -24,7 +25,6 @@ from aeropend_ident.design.investigation import Investigation
 from aeropend_ident.design.limits import Limits
 from aeropend_ident.design.responses import Rows, asked
 from aeropend_ident.diagnosis.diagnosis import diagnose
-from aeropend_ident.diagnosis.document import Which
 from aeropend_ident.diagnosis.isolation.planned import planned
 from aeropend_ident.diagnosis.results import document
 from aeropend_ident.signals.signals import Signals, from_arrays
@@ -167,8 +167,7 @@ def pair(k: int, names: tuple[str, str], seed: int) -> Pair | None:
     length = found.excitation.duration
     rig = drawn_rig(model, {effect: of_size(effect, math.exp(high))}, rng)
     played = (found.excitation, best_before(rows, goal, length)[0], best_before(rows, goal, BEFORE)[0])
-    named = tuple(_named(diagnose(model, [rig.recorded(model, x.series(), rng)]).conclusions.which, effect, rival)
-                  for x in played)
+    named = tuple(_named(rig, model, x, rng, names) for x in played)
     return Pair(effect, rival, length if enough else math.inf, named)  # type: ignore[arg-type]
 
 
@@ -188,8 +187,13 @@ def best_before(rows: Rows, goal: Separate, seconds: float) -> tuple[Excitation,
     return best.holds.excitation, min(a.value for a in best.answers)
 
 
-def _named(which: Which, effect: str, rival: str) -> bool:
-    return which.verdict == effect and not any({effect, rival} <= set(p) for p in which.not_separable)
+def _named(rig: Rig, model: Model, signal: Excitation, rng: np.random.Generator, names: tuple[str, str]) -> bool:
+    """Whether the diagnosis of a recording names the first of two effects, and not the other beside it."""
+    try:
+        which = diagnose(model, [rig.recorded(model, signal.series(), rng)]).conclusions.which
+    except RecordingError:  # a constant duty
+        return False
+    return which.verdict == names[0] and not any(set(names) <= set(p) for p in which.not_separable)
 
 
 # ---- one after another

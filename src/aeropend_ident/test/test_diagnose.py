@@ -13,6 +13,7 @@ from aeropend_ident.diagnosis.document import NextExperiment
 from aeropend_ident.diagnosis.results import experiment
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import rig
+from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import load
 
@@ -139,11 +140,12 @@ def test_the_preset_is_a_model_of_itself(tmp_path, bags):
     path = bags.write(tmp_path / "own", bags.content(len(duty), columns={**columns, "duty": duty}))
     said = here(path, "--out", tmp_path / "out").stdout
     assert said.startswith("verdict: none")
-    (command,) = (line.partition(": isolate ")[2] for line in said.splitlines() if ": isolate " in line)
-    assert shlex.split(command) == [str(path), "--model", "bench"]
+    assert "  would have shown, the hardest first: " in said
     body = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert body["shrink"]["gap"] < 1.5 * body["shrink"]["floor"]
     assert np.isfinite(body["seconds"])
+    assert {w["effect"] for w in body["which"]["would_show"]} == set(CATALOGUE) - {"parameter_mismatch"}
+    assert "What would have shown" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
 
 def test_the_verdict_does_not_depend_on_the_number_of_threads(tmp_path, bags):

@@ -10,20 +10,22 @@ from scipy.sparse.csgraph import structural_rank
 
 from aeropend_ident.commands.isolate import main
 from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.isolation import chance, structure
 from aeropend_ident.diagnosis.isolation.isolate import isolate, judge_of
 from aeropend_ident.diagnosis.isolation.judge import Judge, Rival, _distinct
 from aeropend_ident.diagnosis.isolation.linear import Column, bounded
-from aeropend_ident.diagnosis.isolation.planned import PlanError, planned
+from aeropend_ident.diagnosis.isolation.planned import PlanError, like, planned
 from aeropend_ident.diagnosis.isolation.sizes import smallest
 from aeropend_ident.diagnosis.report import isolation as page
 from aeropend_ident.diagnosis.search import speed_spikes
 from aeropend_ident.diagnosis.search.hypotheses import hypotheses
 from aeropend_ident.diagnosis.search.search import unsearched
-from aeropend_ident.signals.signals import CHANNELS
-from aeropend_sim.model import effect_file
+from aeropend_ident.signals.signals import CHANNELS, from_arrays
+from aeropend_sim.model import effect_file, rig
+from aeropend_sim.model.effects import DEFINED
 from aeropend_sim.model.excitation import Excitation
-from aeropend_sim.model.parameters import load
+from aeropend_sim.model.parameters import SAMPLE_PERIOD, load
 
 BENCH = load("bench")
 DUTY = Excitation(duration=10.0, duty_max=0.6).series()
@@ -218,3 +220,34 @@ def test_a_rival_whose_second_parameter_changes_nothing_has_one_column(judge):
     assert np.isfinite(judge.linear.fit({"theta": noise}, same.columns).log_prior)
     apart = replace(same, columns=(columns[0], Column({"theta": rows[::-1]}, 0.0, 5.0)), starts=(h.own, h.own))
     assert _distinct(apart) is apart
+
+
+@pytest.mark.promise("Verdict", "A verdict of `none` says from which size on each effect would have shown")
+def test_what_would_have_shown_does_and_what_would_not_does_not():
+    """Recordings of other rigs and other noise, with twice and with two fifths of the size that is said."""
+    duty = Excitation(duration=20.0, duty_max=0.55, seed=8).series()
+    read, _ = rig.record(BENCH, duty, 21)
+    nothing = diagnose(BENCH, [from_arrays({**read, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)]).conclusions.which
+    assert nothing.verdict == "none"
+    smallest_of = {w.effect: w.smallest for w in nothing.would_show}
+    for effect in ("coulomb_friction", "voltage_offset", "ground_effect"):
+        verdicts = []
+        for factor in (0.4, 2.0):
+            e = DEFINED[effect]
+            size = e.parameters[e.size]
+            own = {n: p.neutral if p.refines else p.default for n, p in e.parameters.items()}
+            own[e.size] = size.neutral + factor * smallest_of[effect]
+            read, _ = rig.record(BENCH.with_effects({effect: own}), duty, 22)
+            recording = from_arrays({**read, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)
+            verdicts.append(diagnose(BENCH, [recording]).conclusions.which.verdict)
+        assert verdicts[0] == "none", effect
+        assert verdicts[1] != "none", effect
+
+
+def test_a_recording_at_another_rate_keeps_its_length():
+    duty = np.where(np.arange(2000) // 200 % 2, 0.3, 0.1)
+    read, _ = rig.record(BENCH, duty, 1, period=0.01)
+    s = from_arrays({**read, "duty": duty}, 0.01, BENCH.sensing)
+    again = like(BENCH, s)
+    assert (again.period, len(again)) == (s.period, len(s))
+    assert np.nanstd(again.theta - s.theta) < 0.1 * np.nanstd(s.theta)

@@ -302,6 +302,26 @@ class EffectSet:
 
 
 @dataclass(frozen=True)
+class WouldShow:
+    """The smallest size of an effect that a recording would show.
+
+    Attributes:
+        effect: its id.
+        place: of the chain.
+        unit: of the size.
+        usual: size that matters on a rig like this one, as a distance from the neutral one.
+        smallest: smallest distance with which the verdict would not be "none", with a probability of one half; null: it
+            would not show up to ten usual sizes.
+    """
+
+    effect: str
+    place: str
+    unit: str
+    usual: float
+    smallest: float | None
+
+
+@dataclass(frozen=True)
 class Which:
     """Which effect causes the gap.
 
@@ -317,6 +337,7 @@ class Which:
         not_separable: pairs of hypotheses that the recordings cannot separate.
         next_experiment: what to record next; null if nothing is open.
         sets: sets of effects that are likely, where more than one set of a stage is; the likeliest of a stage first.
+        would_show: what would have shown, for the verdict "none" of a calibrated rig.
     """
 
     verdict: str
@@ -330,6 +351,7 @@ class Which:
     next_experiment: NextExperiment | None
     small: tuple[str, ...] = ()
     sets: tuple[EffectSet, ...] = ()
+    would_show: tuple[WouldShow, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -31,7 +30,7 @@ from aeropend_ident.diagnosis.left_open import design_command
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.diagnosis.report import changes, page, sentence
 from aeropend_ident.diagnosis.report.candidates import form_text, open_pairs, strength_text, unit_of
-from aeropend_ident.diagnosis.report.number_format import fit_text, plain, plain_percent, plain_time
+from aeropend_ident.diagnosis.report.number_format import fit_text, plain, plain_percent, plain_quantity, plain_time
 from aeropend_ident.diagnosis.report.parameters import lift_text
 from aeropend_ident.result_folder import atomic_folder, ensure_free
 from aeropend_ident.signals.signals import Signals
@@ -42,6 +41,9 @@ from aeropend_sim.wording import counted, enumerated
 
 FILES = ("diagnosis.json", "report.html", "augmented.yaml")
 """Names of the files that a diagnosis writes."""
+
+HARDEST = 3
+"""Effects whose smallest sizes the terminal shows (layout)."""
 
 PROPOSED = "proposed.yaml"
 """Name of the effect file of the formulas that are proposed for an unknown effect, if there are any."""
@@ -157,9 +159,7 @@ def verdict_lines(document: DiagnosisDocument, *, advice: bool = True) -> list[s
         lines.append(changes.verdict_line(document.since, document.where.place))
     elif which.verdict == "none":
         lines.append(f"verdict: none. {_spaced(headline)}")
-        if advice and document.identified is None and len(document.bags) == 1:
-            words = shlex.join(["isolate", *document.bags, "--model", document.model])
-            lines.append(f"  how small an effect would still show in it: {words}")
+        lines += would_show_lines(document)
     elif which.verdict == CANNOT_TELL:
         lines.append(f"verdict: cannot tell. {why[:1].upper()}{why[1:]}.")
     elif which.verdict == "unknown":
@@ -201,6 +201,21 @@ def verdict_lines(document: DiagnosisDocument, *, advice: bool = True) -> list[s
     if closure.budget is not None:
         lines.append(budget_line(closure.budget))
     lines += [gap_line(f"gap on {across.bag}, not fitted to", across) for across in closure.across]
+    return lines
+
+
+def would_show_lines(document: DiagnosisDocument) -> list[str]:
+    """What would have shown, where nothing did: the effects that are the hardest to see."""
+    shown = document.which.would_show
+    lines = []
+    if unseen := [w.effect for w in shown if w.smallest is None]:
+        lines.append(f"  would not have shown: {enumerated(unseen)}")
+    seen = [(w.smallest / w.usual, w, w.smallest) for w in shown if w.smallest is not None]
+    hardest = sorted(seen, key=lambda x: -x[0])[:HARDEST]
+    if hardest:
+        texts = [f"{w.effect} from {plain_quantity(size, w.unit, 2)} ({plain_percent(share)} % of its usual size)"
+                 for share, w, size in hardest]
+        lines.append(f"  would have shown, the hardest first: {', '.join(texts)}, ...; the report lists all")
     return lines
 
 

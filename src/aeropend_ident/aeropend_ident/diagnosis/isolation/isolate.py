@@ -11,11 +11,13 @@ from functools import partial
 from threadpoolctl import threadpool_limits
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.document import WouldShow
 from aeropend_ident.diagnosis.isolation import structure
 from aeropend_ident.diagnosis.isolation.judge import Judge, Truth
+from aeropend_ident.diagnosis.isolation.planned import like
 from aeropend_ident.diagnosis.isolation.sizes import Smallest, smallest
 from aeropend_ident.diagnosis.policy import CALIBRATED, MATERIAL_SHARE
-from aeropend_ident.diagnosis.search.hypotheses import hypotheses, other_forms
+from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, hypotheses, other_forms
 from aeropend_ident.signals.signals import CHANNELS, Signals
 from aeropend_sim.model.effects import DEFINED, RANDOM
 from aeropend_sim.model.parameters import Model
@@ -190,6 +192,29 @@ def _shown(truth: Truth, found: Smallest) -> EffectShown:
     effect = DEFINED[truth.hypothesis.effect]
     return EffectShown(effect.id, effect.form_of, effect.place, effect.size, truth.unit, abs(truth.usual), found.seen,
                        found.named, found.rivals)
+
+
+def would_show(model: Model, recordings: Sequence[Signals], further: Sequence[str] = (),
+               material: float = MATERIAL_SHARE, jobs: int = 1) -> tuple[WouldShow, ...]:
+    """The smallest size of each effect that the longest of some recordings would show.
+
+    Args:
+        model: the nominal model of a calibrated rig.
+        recordings: of the rig.
+        further: ids of effects of effect files.
+        material: share of the gap from which an effect is claimed.
+        jobs: threads.
+    """
+    s = max(recordings, key=len)
+    judge = judge_of(model, like(model, s), further, material, rivals=False)
+
+    def one(h: Hypothesis) -> WouldShow:
+        truth = judge.truth(h)
+        return WouldShow(h.effect, h.place, truth.unit, abs(truth.usual),
+                         smallest(judge, truth, name=False, quickly=True).seen)
+
+    with threadpool_limits(1), ThreadPoolExecutor(jobs) as pool:
+        return tuple(pool.map(one, judge.hypotheses))
 
 
 def _at_size(judge: Judge, truth: Truth, seen: float | None, sizes: Mapping[str, float]) -> AtSize:

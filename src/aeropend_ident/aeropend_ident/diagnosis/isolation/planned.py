@@ -25,15 +25,17 @@ class PlanError(UserError):
     """An experiment that cannot be planned. The message is one line."""
 
 
-def planned(model: Model, duty: Array, channels: Collection[str] = tuple(CHANNELS)) -> Signals:
+def planned(model: Model, duty: Array, channels: Collection[str] = tuple(CHANNELS), period: float = SAMPLE_PERIOD
+            ) -> Signals:
     """The recording of a rig that is like the model, with the noise that the model file states.
 
     It is read as a recording is: noise, resolution and pulses are those that a diagnosis would find.
 
     Args:
         model: the nominal model.
-        duty: (N,) 0..1, held for one `SAMPLE_PERIOD`.
+        duty: (N,) 0..1, held for one period each.
         channels: that are measured; `theta` must be among them.
+        period: [s] between samples.
 
     Raises:
         PlanError: an unknown channel, or no angle.
@@ -43,10 +45,10 @@ def planned(model: Model, duty: Array, channels: Collection[str] = tuple(CHANNEL
         raise PlanError(f"'{wrong[0]}' is no channel: give some of {', '.join(CHANNELS)}")
     if "theta" not in channels:
         raise PlanError("no diagnosis without the angle of the arm: add theta to the channels")
-    columns, _ = rig.record(model, duty, SEED)
+    columns, _ = rig.record(model, duty, SEED, period)
     nothing = np.full(len(duty), np.nan)
     read = {c: columns[c] if c in channels else nothing for c in CHANNELS}
-    return from_arrays({**read, "duty": duty}, SAMPLE_PERIOD, model.sensing, name="the planned recording")
+    return from_arrays({**read, "duty": duty}, period, model.sensing, name="the planned recording")
 
 
 def like(model: Model, s: Signals, channels: Collection[str] | None = None) -> Signals:
@@ -61,4 +63,4 @@ def like(model: Model, s: Signals, channels: Collection[str] | None = None) -> S
     if channels is not None and (missing := [c for c in channels if c not in there]):
         raise PlanError(f"the recording has no {missing[0]}: it has {', '.join(there)}")
     same = replace(model, sensing=own_sensing(model, [s]))
-    return planned(same, s.duty, there if channels is None else channels)
+    return planned(same, s.duty, there if channels is None else channels, s.period)

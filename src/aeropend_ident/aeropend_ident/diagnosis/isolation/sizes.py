@@ -27,6 +27,9 @@ ROUGHLY = 0.4
 NEAR = 0.02
 """Relative change of a size below which a search for it ends (choice: far below the scatter of noise)."""
 
+QUICKLY = 0.15
+"""As `NEAR`, where all effects are only listed (choice: the noise of one recording changes a size by more)."""
+
 FACTOR = 1.25
 """Factor between two sizes of a scan (choice: half of it is far below the scatter of noise)."""
 
@@ -56,13 +59,14 @@ class Smallest:
     rivals: dict[str, float]
 
 
-def smallest(judge: Judge, truth: Truth, *, name: bool = True) -> Smallest:
+def smallest(judge: Judge, truth: Truth, *, name: bool = True, quickly: bool = False) -> Smallest:
     """The smallest sizes of an effect.
 
     Args:
         judge: of the planned recording.
         truth: the effect.
         name: whether the size at which it is named is looked for too.
+        quickly: whether one rig and a rough size are enough: where all effects are only listed.
     """
     if truth.hypothesis.effect == "speed_spikes":
         rate = chance.spikes(judge)
@@ -73,7 +77,7 @@ def smallest(judge: Judge, truth: Truth, *, name: bool = True) -> Smallest:
     if not truth.stages:
         return Smallest(None, None, {})
     largest = min(LARGEST * abs(truth.usual), truth.largest)
-    shown = _crossing(partial(judge.margin, truth), FIRST * abs(truth.usual), largest)
+    shown = _crossing(partial(judge.margin, truth), FIRST * abs(truth.usual), largest, quickly=quickly)
     shown = None if shown is None else max(shown, LEAST * abs(truth.usual))
     seen = None if shown is None else _first(lambda size: judge.is_sure(truth, size), shown, largest)
     if seen is None or not name:
@@ -83,21 +87,22 @@ def smallest(judge: Judge, truth: Truth, *, name: bool = True) -> Smallest:
     return Smallest(seen, named, judge.probabilities(truth, seen) if rivals is None else rivals)
 
 
-def _crossing(margin: Margin, first: float, largest: float) -> float | None:
+def _crossing(margin: Margin, first: float, largest: float, *, quickly: bool = False) -> float | None:
     """The size at which a margin becomes 0; None above the largest."""
+    near = QUICKLY if quickly else NEAR
     size, low, high = min(first, largest), 0.0, math.inf
     for _ in range(MOST_STEPS):
         m = margin(size, roughly=True)
-        if abs(m) < ROUGHLY:
+        if abs(m) < ROUGHLY and not quickly:
             m = margin(size)
-        if abs(m) < NEAR:
+        if abs(m) < near:
             return size
         low, high = (size, high) if m < 0.0 else (low, size)
         if low >= largest:
             return None
         size *= math.exp(min(max(-m, -2.0), 1.5))
-        if not low < size < high or (low > 0.0 and high < (1.0 + NEAR) * low):
-            if low > 0.0 and high < (1.0 + NEAR) * low:
+        if not low < size < high or (low > 0.0 and high < (1.0 + near) * low):
+            if low > 0.0 and high < (1.0 + near) * low:
                 return high
             size = math.sqrt(low * high) if low > 0.0 else 0.5 * high
         size = min(size, largest)

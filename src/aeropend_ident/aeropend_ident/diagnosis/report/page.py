@@ -88,7 +88,8 @@ def render(diagnosis: Diagnosis, document: DiagnosisDocument, command: str) -> s
         width=WIDTH, height=HEIGHT, origin=origin, verdict=verdict.section(document, rows),
         care=care.reasons(document, diagnosis.signals, rows, table.rows), gap=gap.section(document),
         location=location.section(document, diagnosis.misfit, rows), unknown=curves.section(diagnosis, document),
-        candidates=candidates.section(document, rows), parameters=table, changes=changes.section(document),
+        candidates=candidates.section(document, rows), would_show=document.which.would_show,
+        parameters=table, changes=changes.section(document),
         traces=traces.section(diagnosis, document), residuals=residuals.section(diagnosis, document),
         recordings=_recordings(document, diagnosis.signals))
 
