@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 
+from aeropend_ident.design.responses import asked
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.left_open import as_refitted, design_command, left_open
 from aeropend_ident.diagnosis.results import document, verdict_lines
@@ -39,6 +40,22 @@ def test_where_nothing_is_open_nothing_is_asked(lag):
     closed = replace(lag, which=replace(lag.which, not_separable=()))
     assert left_open(closed).names == ()
     assert design_command(closed) == ""
+
+
+def test_an_experiment_is_designed_for_a_rig_that_has_what_is_sure():
+    """Friction that nothing imitates, beside a lag that something does."""
+    duty = Excitation(duration=20.0, seed=4).series()
+    both = {"thrust_lag": {"tau": 0.008}, "coulomb_friction": {"accel": 0.4}}
+    read, _ = rig.record(BENCH.with_effects(both), duty, 3)
+    found = diagnose(BENCH, [from_arrays({**read, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)])
+    made = document(found, ["bag"], "bench", 1.0)
+    assert "coulomb_friction" not in left_open(made).names
+    model = as_refitted(BENCH, made)
+    assert set(model.effects) == {"coulomb_friction"}
+    assert model.effects["coulomb_friction"]["accel"] == pytest.approx(0.4, rel=0.1)
+    effects = asked(model, sizes=left_open(made).sizes)
+    assert "coulomb_friction" not in effects
+    assert set(left_open(made).names) <= set(effects)
 
 
 def test_an_experiment_is_designed_for_the_numbers_that_were_fitted(lag):

@@ -12,13 +12,14 @@ from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis, adopted
 from aeropend_ident.diagnosis.search.hypotheses import hypotheses
 from aeropend_ident.diagnosis.search.search import _without_unneeded
-from aeropend_ident.diagnosis.search.sets import LinearStage, likely_sets, names, with_best_set
+from aeropend_ident.diagnosis.search.sets import LinearStage, compared, names, with_best_set
 from aeropend_ident.estimation.linear_sets import LinearSets
-from aeropend_ident.estimation.map_fit import fit
-from aeropend_ident.estimation.parameter import Parameter
+from aeropend_ident.estimation.map_fit import fit, with_posterior_slopes
+from aeropend_ident.estimation.parameter import Parameter, started
 from aeropend_ident.signals.signals import from_arrays
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import rig
+from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
 N = 3000
@@ -104,9 +105,9 @@ def test_the_right_set_stays_as_it_is(chains, pool):
     assert with_best_set(chains, findings, nominal, candidates, pool) is findings
 
 
-def test_the_sets_that_are_likely_are_those_whose_fits_are(chains):
+def test_the_sets_that_are_likely_are_those_whose_fits_are(chains, pool):
     findings, nominal, candidates = found_alone(chains, "thrust_lag", "quadratic_drag")
-    first, *others = likely_sets(chains, findings, nominal, candidates)
+    first, *others = compared(chains, findings, nominal, candidates, pool).sets
     assert set(first.effects) == {"thrust_lag", "quadratic_drag"}
     assert first.probability + sum(s.probability for s in others) <= 1.0
     assert [s.probability for s in others] == sorted((s.probability for s in others), reverse=True)
@@ -127,3 +128,41 @@ def test_a_search_that_starts_from_the_wrong_lag_ends_at_the_right_one(chains, p
     findings = replace(wrong, found=((wrong.found[0][0], right.found[0][0]), wrong.found[1]))
     best = with_best_set(chains, findings, nominal, candidates, pool)
     assert {h.name for h in best.effects} == {"thrust_lag", "quadratic_drag"}
+
+
+def sticking(tau, seed):
+    """A rig whose arm sticks, and whose thrust lags; its chains."""
+    duty = Excitation(duration=20.0, seed=4).series()
+    effects = {"thrust_lag": {"tau": tau}, "coulomb_friction": {"accel": 0.4}}
+    read, _ = rig.record(BENCH.with_effects(effects), duty, seed)
+    return CutChains(BENCH, [from_arrays({**read, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)])
+
+
+@pytest.mark.promise("Verdict", "Each effect of several is compared with its rivals beside the others")
+@pytest.mark.parametrize(("tau", "told_apart"), [(0.008, False), (0.03, True)])
+def test_a_rival_is_fitted_beside_the_other_effects(tau, told_apart, pool):
+    """A short lag of the thrust is like one of the encoder, a long one is not."""
+    chains = sticking(tau, 4)
+    findings, nominal, candidates = found_alone(chains, "coulomb_friction", "encoder_lag")
+    found = compared(chains, findings, nominal, candidates, pool)
+    lag = next(s for s in found.found if s[0].hypothesis.place != "arm")
+    probability = {r.hypothesis.name: r.probability for r in lag}
+    assert (probability["encoder_lag"] < 0.05) == told_apart
+    assert probability["thrust_lag"] > 0.2
+    assert sum(p for p in probability.values()) == pytest.approx(1.0, abs=0.01)
+    if told_apart:  # the better one takes its place
+        assert {h.name for h in found.effects} == {"coulomb_friction", "thrust_lag"}
+        assert found.final.values["thrust_lag.tau"] == pytest.approx(tau, rel=0.1)
+
+
+def test_the_information_of_an_arm_that_sticks_does_not_depend_on_the_path_of_the_fit():
+    """Two fits that end at the same place, from other starts."""
+    chains = sticking(0.02, 4)
+    residuals, nominal = chains.residuals("arm"), nominal_parameters(chains, "arm")
+    own = {h.name: h for h in hypotheses(BENCH)}
+    known = adopted(adopted(nominal, own["coulomb_friction"]), own["encoder_lag"])
+    fits = [fit(residuals, started(known, {"encoder_lag.tau": tau})) for tau in (0.003, 0.01)]
+    assert fits[0].log_likelihood == pytest.approx(fits[1].log_likelihood, abs=0.1)
+    ess = fits[0].ess
+    told = [with_posterior_slopes(residuals, known, f).log_occam(ess) for f in fits]
+    assert told[0] == pytest.approx(told[1], abs=0.5)

@@ -53,14 +53,20 @@ def left_open(document: DiagnosisDocument) -> Open:
 
 
 def as_refitted(model: Model, document: DiagnosisDocument) -> Model:
-    """A model with its numbers as a verdict has refitted them.
+    """A model with what a verdict is sure of: its numbers as they were refitted, and the effects without a rival.
 
     Args:
         model: the nominal model of the verdict.
         document: of the diagnosis.
     """
     numbers = {n: row.value for n, row in document.which.numbers.items() if n in model.model}
-    return replace(model, model={**model.model, **numbers})
+    open_ = left_open(document).names
+    sure = {}
+    for c in document.which.candidates:
+        if c.found and c.law in DEFINED and c.effect not in (*open_, *RANDOM, PARAMETER_MISMATCH):
+            rest = {n: p.neutral if p.refines else p.default for n, p in DEFINED[c.law].parameters.items()}
+            sure[c.law] = {**rest, **{n: x.value for n, x in c.parameters.items() if n in rest}}
+    return replace(model, model={**model.model, **numbers}).with_effects({**model.effects, **sure})
 
 
 def design_command(document: DiagnosisDocument) -> str:

@@ -39,7 +39,7 @@ from aeropend_ident.diagnosis.search.selection import (
     shared,
     squared_gap,
 )
-from aeropend_ident.diagnosis.search.sets import likely_sets, with_best_set
+from aeropend_ident.diagnosis.search.sets import compared, with_best_set
 from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess, passed
 from aeropend_ident.estimation.parameter import Parameter, started
 
@@ -185,7 +185,7 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
             findings = _with_best_forms(chains, _with_better_rivals(chains, findings, nominal), nominal, pool)
     findings = _without_unneeded(chains, findings, nominal, trifle)
     if findings.found and several and not passed(deadline):
-        findings = replace(findings, sets=likely_sets(chains, findings, nominal, candidates))
+        findings = compared(chains, findings, nominal, candidates, pool)
     return findings
 
 

@@ -9,6 +9,7 @@ fitted; the search goes on from there until no set is better.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -25,7 +26,7 @@ from aeropend_ident.diagnosis.search.findings import Findings, LikelySet, Ranked
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, from_linear, linear_parameters
 from aeropend_ident.diagnosis.search.selection import ALIKE, CONTENDERS, ROUNDS, squared_gap
 from aeropend_ident.estimation.linear_sets import LinearSets
-from aeropend_ident.estimation.map_fit import Fit, finite, fit, prior_information, sensitivities
+from aeropend_ident.estimation.map_fit import Fit, finite, fit, prior_information, sensitivities, with_posterior_slopes
 from aeropend_ident.estimation.parameter import Parameter, started
 from aeropend_sim.model.effects import DEFINED
 
@@ -47,6 +48,15 @@ Choice: a linear model errs by as much."""
 
 FIRST_ROUNDS = 2
 """Rounds of the first fit of a set; one that promises is fitted to its end (choice: it starts close to its end)."""
+
+SWAPS = 3
+"""Times that a rival may take the place of an effect (choice: it seldom happens twice)."""
+
+CLOSEST = 2
+"""Rivals of an effect that are fitted although the linear model calls them unlikely (choice)."""
+
+IMITATES = 0.5
+"""Share of the log evidence of an effect that such a rival must have (choice: less is no imitation)."""
 
 SMALL = 0.01
 """Step, in standard deviations of the prior, of the derivatives of an effect that is linear in two parameters (choice).
@@ -222,6 +232,11 @@ class LinearStage:
         parameters = reduce(adopted, [m.hypothesis for m in members], [t.parameter for t in self.nominal])
         return fit(self._residuals, started(parameters, {**self.findings.final.values, **values}), rounds)
 
+    def compared(self, members: Set, f: Fit) -> Fit:
+        """The fit of a set with the information of its posterior, for a comparison of log evidences."""
+        parameters = reduce(adopted, [m.hypothesis for m in members], [t.parameter for t in self.nominal])
+        return with_posterior_slopes(self._residuals, parameters, f)
+
     def neighbours(self, members: Set) -> Iterator[Set]:
         """The sets with one effect less, one more, or one in place of another."""
         smaller = [tuple(m for m in members if m is not gone) for gone in members]
@@ -247,29 +262,122 @@ class LinearStage:
             here, best, least = members, top, top.log_evidence + LEAST
 
 
-def likely_sets(chains: CutChains, findings: Findings, nominal: Sequence[Parameter],
-                candidates: Sequence[Hypothesis]) -> tuple[LikelySet, ...]:
-    """The sets of effects that are likely: of what was found, and of sets that differ by one effect.
+def compared(chains: CutChains, findings: Findings, nominal: Sequence[Parameter], candidates: Sequence[Hypothesis],
+             pool: ThreadPoolExecutor) -> Findings:
+    """The findings with each effect compared with its rivals beside the others, and the sets that are likely.
 
-    Sets that differ in the form of an effect are one, with the form that is likeliest.
+    The closest rivals are fitted: a lag of the thrust and one of the reading, say, differ by the square of their size,
+    which no linear model sees. A rival that is better takes the place of the effect.
 
     Args:
         chains: the cut chains.
         findings: of a stage.
         nominal: parameters of the stage without effects.
         candidates: effects that may be members of a set.
+        pool: threads.
     """
-    linear = LinearStage(chains, findings, nominal, candidates)
-    found: dict[frozenset[str], tuple[float, Set]] = {}
+    for _ in range(SWAPS):
+        linear = LinearStage(chains, findings, nominal, candidates)
+        swaps = _swaps(linear, pool) if len(findings.found) > 1 else []
+        best = max(swaps, key=lambda s: s.gain, default=None)
+        if best is None or best.gain <= LEAST:
+            break
+        first = RankedHypothesis(best.member.hypothesis, best.fit, findings.found[best.place][0].gain + best.gain, 1.0)
+        found = [(replace(s[0], fit=best.fit), *s[1:]) for s in findings.found]
+        found[best.place] = (first, *findings.found[best.place])
+        findings = replace(findings, final=best.fit, found=tuple(found))
+    found = [_ranked(linear, k, selection, swaps) for k, selection in enumerate(findings.found)]
+    return replace(findings, found=tuple(found), sets=_likely_sets(linear, swaps))
+
+
+class _Swap(NamedTuple):
+    """A set with one effect in place of another, fitted.
+
+    Attributes:
+        place: number of the effect that is replaced.
+        member: what stands in its place.
+        gain: log evidence over that of what was found, prior odds included.
+        fit: of the set.
+    """
+
+    place: int
+    member: Member
+    gain: float
+    fit: Fit
+
+
+def _swaps(linear: LinearStage, pool: ThreadPoolExecutor) -> list[_Swap]:
+    """For each effect found its closest rivals, fitted beside the others."""
+    begun = []
+    for k, mine in enumerate(linear.found):
+        others = tuple(m for m in linear.found if m is not mine)
+        here, none = linear.predicted(linear.found).log_evidence, linear.predicted(others).log_evidence
+        rivals = sorted(_best_of_families(linear, others), key=lambda r: -r[1].log_evidence)
+        for j, (m, there) in enumerate(rivals):
+            close = there.log_evidence - none > IMITATES * (here - none)
+            if (close and j < CLOSEST) or there.log_evidence > here + math.log(CALIBRATED.undecided):
+                begun.append((k, m, tuple(m if x is mine else x for x in linear.found), there.values))
+    if not begun:
+        return []
+    now = pool.submit(linear.compared, linear.found, linear.findings.final)
+    fits = list(pool.map(lambda one: linear.compared(one[2], linear.fitted(one[2], one[3])), begun))
+    findings = replace(linear.findings, final=now.result())
+    return [_Swap(k, m, _gain(findings, [x.hypothesis for x in members], f), f)
+            for (k, m, members, _), f in zip(begun, fits, strict=True)]
+
+
+def _best_of_families(linear: LinearStage, others: Set) -> list[tuple[Member, Predicted]]:
+    """Of each family that is not in a set the member that is best beside it."""
+    taken = {m.hypothesis.family for m in linear.found}
+    best: dict[str, tuple[Member, Predicted]] = {}
+    for m in linear.options:
+        there, family = linear.predicted((*others, m)), m.hypothesis.family
+        if family not in taken and there.log_evidence > (best[family][1].log_evidence if family in best else -np.inf):
+            best[family] = m, there
+    return list(best.values())
+
+
+def _ranked(linear: LinearStage, place: int, selection: Selection, swaps: Sequence[_Swap]) -> Selection:
+    """The selection of an effect, with the probabilities that it and its rivals have beside the others."""
+    if len(linear.found) == 1:
+        return selection
+    mine = linear.found[place]
+    others = tuple(m for m in linear.found if m is not mine)
+    here, none = linear.predicted(linear.found).log_evidence, linear.predicted(others).log_evidence
+    gains = {m.hypothesis.family: there.log_evidence - here for m, there in _best_of_families(linear, others)}
+    fitted = {s.member.hypothesis.family: s for s in swaps if s.place == place}
+    gains |= {family: s.gain for family, s in fitted.items()}
+    weight = {family: float(np.exp(min(gain, 0.0))) for family, gain in gains.items()}
+    total = 1.0 + sum(weight.values()) + float(np.exp(min(none - here, 0.0)))
+    first = replace(selection[0], probability=1.0 / total)
+    rivals = [RankedHypothesis(s.member.hypothesis, s.fit, first.gain + s.gain, weight[family] / total)
+              for family, s in fitted.items()]
+    rivals += [replace(r, probability=weight.get(r.hypothesis.family, 0.0) / total) for r in selection[1:]
+               if r.hypothesis.family not in {*fitted, mine.hypothesis.family}]
+    return (first, *sorted(rivals, key=lambda r: -r.probability))
+
+
+def _likely_sets(linear: LinearStage, swaps: Sequence[_Swap]) -> tuple[LikelySet, ...]:
+    """The sets of effects that are likely: of what was found, and of sets that differ by one effect.
+
+    Sets that differ in the form of an effect are one, with the form that is likeliest.
+    """
+    found: dict[frozenset[str], tuple[float, tuple[str, ...]]] = {}
+    here = linear.predicted(linear.found).log_evidence
+    fitted = [(here + s.gain, tuple(s.member.hypothesis.family if k == s.place else m.hypothesis.family
+                                    for k, m in enumerate(linear.found))) for s in swaps]
+    known = {frozenset(families) for _, families in fitted}
     for members in (linear.found, *linear.neighbours(linear.found)):
-        effects, there = frozenset(m.hypothesis.family for m in members), linear.predicted(members).log_evidence
-        if there > found.get(effects, (-np.inf,))[0]:
-            found[effects] = there, members
+        families = tuple(m.hypothesis.family for m in members)
+        if frozenset(families) not in known:
+            fitted.append((linear.predicted(members).log_evidence, families))
+    for there, families in fitted:
+        if there > found.get(frozenset(families), (-np.inf,))[0]:
+            found[frozenset(families)] = there, families
     log_evidence = np.array([e for e, _ in found.values()])
     weights = np.exp(log_evidence - log_evidence.max())
-    likely = [LikelySet(tuple(m.hypothesis.family for m in members), float(p))
-              for (_, members), p in zip(found.values(), weights / weights.sum(), strict=True)
-              if p > CALIBRATED.undecided]
+    likely = [LikelySet(families, float(p)) for (_, families), p in zip(found.values(), weights / weights.sum(),
+                                                                       strict=True) if p > CALIBRATED.undecided]
     return tuple(sorted(likely, key=lambda s: -s.probability))
 
 
@@ -310,7 +418,7 @@ def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Param
     if best.findings is findings:
         return findings
     return replace(best.findings, rivals=findings.rivals, found=tuple(
-        s if m.hypothesis.name in found else _with_rivals(best, m, findings)
+        s if m.hypothesis.name in found else _anew(best, m, findings)
         for m, s in zip(best.found, best.findings.found, strict=True)))
 
 
@@ -351,36 +459,19 @@ def _before(findings: Findings, h: Hypothesis, f: Fit) -> Selection:
     return (RankedHypothesis(h, f, 0.0, 1.0),)
 
 
-def _with_rivals(linear: LinearStage, mine: Member, begun: Findings) -> Selection:
-    """The selection of an effect that only the comparison of sets found: its rivals are those of the best set.
+def _anew(linear: LinearStage, mine: Member, begun: Findings) -> Selection:
+    """The selection of an effect that only the comparison of sets found; its rivals are not known yet (`compared`).
 
     Args:
         linear: the stage with the best set.
         mine: the effect.
         begun: the findings before the comparison.
     """
-    others = tuple(m for m in linear.found if m is not mine)
-    here, none = linear.predicted(linear.found).log_evidence, linear.predicted(others).log_evidence
-    taken = {m.hypothesis.family for m in linear.found}
-    rivals: dict[str, tuple[Member, Predicted]] = {}
-    for m in linear.options:
-        family, there = m.hypothesis.family, linear.predicted((*others, m))
-        if family not in taken and there.log_evidence > (
-                rivals[family][1].log_evidence if family in rivals else -np.inf):
-            rivals[family] = m, there
-    weight = {family: float(np.exp(min(there.log_evidence - here, 0.0))) for family, (_, there) in rivals.items()}
-    total = 1.0 + sum(weight.values()) + float(np.exp(min(none - here, 0.0)))
+    none = linear.predicted(tuple(m for m in linear.found if m is not mine)).log_evidence
     ranked = {r.hypothesis.family: r for s in reversed(begun.selections) for r in reversed(s)}
-    found = []
-    for family, (m, there) in rivals.items():
-        p = weight[family] / total
-        if p > CALIBRATED.undecided:
-            f = linear.fitted(tuple(m if x is mine else x for x in linear.found), there.values, FIRST_ROUNDS)
-            found.append(RankedHypothesis(m.hypothesis, f, there.log_evidence - none, p))
-        elif family in ranked:
-            found.append(replace(ranked[family], probability=p))
-    was = ranked.get(mine.hypothesis.family)
+    was = ranked.pop(mine.hypothesis.family, None)
     forms = [] if was is None else [x for x in (was, *was.others) if x.hypothesis.name != mine.hypothesis.name]
-    first = RankedHypothesis(mine.hypothesis, linear.findings.final, here - none, 1.0 / total,
+    first = RankedHypothesis(mine.hypothesis, linear.findings.final,
+                             linear.predicted(linear.found).log_evidence - none, 1.0,
                              tuple(replace(x, others=(), probability=0.0) for x in forms))
-    return (first, *sorted(found, key=lambda r: -r.probability))
+    return (first, *(replace(r, probability=0.0) for r in ranked.values()))
