@@ -45,15 +45,16 @@ def test_a_rig_that_somebody_drives_is_left_alone(tmp_path):
             assert "something drives the rig on /driven/duty_command already" in inquiry.output
 
 
-def test_ctrl_c_during_an_experiment_stops_the_motor(tmp_path, graph):
-    rig = ["-r", "__ns:=/stopped"]
+@pytest.mark.parametrize(("ended", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)])
+def test_however_it_ends_during_an_experiment_the_motor_stops(tmp_path, graph, ended, code):
+    rig = ["-r", f"__ns:=/stopped{int(ended)}"]
     with Process("plant", "--ros-args", *rig) as plant:
         plant.wait_for("model bench")
         with (
             Process("investigate", *SMALL, "--out", str(tmp_path / "out"), "--ros-args", *rig) as inquiry,
-            graph.listening(Float64, "/stopped/duty_command") as duties,
+            graph.listening(Float64, f"/stopped{int(ended)}/duty_command") as duties,
         ):
             graph.until(lambda: any(d.data > 0.1 for d in duties), "a duty")
-            assert inquiry.send(signal.SIGINT).wait() == 130
-            assert "the motor is off" in inquiry.output
+            assert inquiry.send(ended).wait() == code
+            assert ended is signal.SIGKILL or "the motor is off" in inquiry.output
             graph.until(lambda: [d.data for d in duties[-5:]] == [0.0] * 5, "five times duty 0")

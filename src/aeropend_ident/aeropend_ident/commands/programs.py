@@ -21,6 +21,15 @@ from aeropend_sim.wording import enumerated
 STARTUP = 30.0
 """[s] Time that programs may take to find each other (choice: a loaded machine takes some seconds)."""
 
+START = """
+import ctypes, runpy, signal, sys
+if sys.platform == "linux":  # interrupted when the parent ends, even if that is killed: the motor then stops
+    ctypes.CDLL(None).prctl(1, signal.SIGINT)  # PR_SET_PDEATHSIG
+del sys.argv[0]
+runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+"""
+"""How a program starts."""
+
 MODULES = {"plant": "aeropend_sim.nodes.plant", "excite": "aeropend_control.nodes.excite",
            "record": "aeropend_ident.nodes.record", "diagnose": "aeropend_ident.commands.diagnose",
            "controller": "aeropend_control.nodes.controller", "reference": "aeropend_control.nodes.reference",
@@ -35,8 +44,8 @@ class ProgramError(UserError):
 def process(name: str, *arguments: str, environment: dict[str, str], log: Path) -> Iterator[subprocess.Popen[str]]:
     """A program of ours, its output in a file; stopped when the block is left, whatever happens."""
     with log.open("w", encoding="utf-8") as file:
-        child = subprocess.Popen([sys.executable, "-m", MODULES[name], *arguments], env=environment, stdout=file,
-                                 stderr=subprocess.STDOUT, text=True, start_new_session=True)
+        child = subprocess.Popen([sys.executable, "-c", START, MODULES[name], *arguments], env=environment,
+                                 stdout=file, stderr=subprocess.STDOUT, text=True, start_new_session=True)
         try:
             yield child
         finally:
