@@ -12,7 +12,7 @@ from aeropend_sim.model import excitation_file
 
 pytestmark = pytest.mark.live
 
-SMALL = ("--yes", "--tries", "24", "--theta", "-0.8", "1.2")
+SMALL = ("--yes", "--tries", "4", "--theta", "-0.8", "1.2")
 """Few signals are tried, so that the test takes no longer than it must."""
 
 

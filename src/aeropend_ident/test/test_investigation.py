@@ -17,10 +17,18 @@ BENCH = load("bench")
 LIMITS = Limits(theta=(-0.8, 1.2))
 
 
-def investigated(effects, most, seed=5):
+SIGNALS = planned(BENCH, Excitation(duration=10.0).series())
+
+
+@pytest.fixture(scope="module")
+def first():
+    """The first experiment, which is the same for all rigs."""
+    return Investigation(BENCH, SIGNALS, LIMITS, 120.0, tries=24, jobs=2).next().designed
+
+
+def investigated(first, effects, most, seed=5):
     """The inquiry on a rig with some effects, played on the simulated rig, and its verdicts."""
-    signals = planned(BENCH, Excitation(duration=10.0).series())
-    inquiry, verdicts = Investigation(BENCH, signals, LIMITS, most, tries=24, jobs=2), []
+    inquiry, verdicts = Investigation(BENCH, SIGNALS, LIMITS, most, tries=8, first=first, jobs=2), []
     while (proposal := inquiry.next()) is not None:
         duty = proposal.designed.excitation.series()
         read, truth = rig.record(BENCH.with_effects(effects), duty, seed + len(verdicts))
@@ -33,23 +41,23 @@ def investigated(effects, most, seed=5):
 
 
 @pytest.mark.promise("Verdict", "`investigate` makes one experiment after another until the verdict is sure")
-def test_a_clear_effect_needs_one_experiment():
-    inquiry, verdicts = investigated({"coulomb_friction": {"accel": 0.4}}, 120.0)
+def test_a_clear_effect_needs_one_experiment(first):
+    inquiry, verdicts = investigated(first, {"coulomb_friction": {"accel": 0.4}}, 120.0)
     assert [w.verdict for w in verdicts] == ["coulomb_friction"]
     assert inquiry.sure
     assert inquiry.moved == pytest.approx(LENGTH, abs=0.1)
 
 
-def test_what_one_experiment_leaves_open_another_one_is_for():
-    inquiry, verdicts = investigated({"cable_torque": {"k": 0.25, "theta0": 0.4}}, 120.0)
+def test_what_one_experiment_leaves_open_another_one_is_for(first):
+    inquiry, verdicts = investigated(first, {"cable_torque": {"k": 0.25, "theta0": 0.4}}, 120.0)
     assert verdicts[0].not_separable
     assert len(verdicts) > 1
     assert inquiry.sure
     assert verdicts[-1].verdict == "cable_torque"
 
 
-def test_it_ends_when_the_time_is_over():
-    inquiry, verdicts = investigated({"thrust_lag": {"tau": 0.008}}, 30.0)
+def test_it_ends_when_the_time_is_over(first):
+    inquiry, verdicts = investigated(first, {"thrust_lag": {"tau": 0.008}}, 30.0)
     assert len(verdicts) == 1
     assert not inquiry.sure
     assert "apart" in inquiry.ended or "not sure after 20 s" in inquiry.ended
