@@ -3,6 +3,7 @@
 
 import json
 import signal
+import sys
 
 import pytest
 from evaluation.support.graph import Process, parameters
@@ -16,13 +17,21 @@ SMALL = ("--yes", "--tries", "4", "--theta", "-0.8", "1.2")
 """Few signals are tried, so that the test takes no longer than it must."""
 
 
+class Inquiry(Process):
+    """The command: it starts nodes, and is none itself."""
+
+    def command(self, *args: str) -> list[str]:
+        """What is run."""
+        return [sys.executable, "-m", "aeropend_ident.commands.investigate", *args]
+
+
 @pytest.mark.promise("Verdict", "`investigate` works on a running plant, and the motor is off at the end")
 def test_a_running_rig_is_investigated_until_the_verdict_is_sure(tmp_path):
     rig = ["-r", "__ns:=/asked"]
     out = tmp_path / "out"
     with Process("plant", *parameters(effects__coulomb_friction__accel=0.5, seed=3), *rig) as plant:
         plant.wait_for("model bench")
-        with Process("investigate", *SMALL, "--out", str(out), "--ros-args", *rig) as inquiry:
+        with Inquiry("investigate", *SMALL, "--out", str(out), "--ros-args", *rig) as inquiry:
             assert inquiry.wait(180.0) == 0, inquiry.output
             said = inquiry.output
     assert "verdict: coulomb_friction (arm)" in said
@@ -40,7 +49,7 @@ def test_a_rig_that_somebody_drives_is_left_alone(tmp_path):
         Process("excite", *parameters(kind="hold", duty=0.1, duration=300.0), *rig) as other,
     ):
         other.wait_for("hold")
-        with Process("investigate", *SMALL, "--out", str(tmp_path / "out"), "--ros-args", *rig) as inquiry:
+        with Inquiry("investigate", *SMALL, "--out", str(tmp_path / "out"), "--ros-args", *rig) as inquiry:
             assert inquiry.wait() == 2
             assert "something drives the rig on /driven/duty_command already" in inquiry.output
 
@@ -51,7 +60,7 @@ def test_however_it_ends_during_an_experiment_the_motor_stops(tmp_path, graph, e
     with Process("plant", "--ros-args", *rig) as plant:
         plant.wait_for("model bench")
         with (
-            Process("investigate", *SMALL, "--out", str(tmp_path / "out"), "--ros-args", *rig) as inquiry,
+            Inquiry("investigate", *SMALL, "--out", str(tmp_path / "out"), "--ros-args", *rig) as inquiry,
             graph.listening(Float64, f"/stopped{int(ended)}/duty_command") as duties,
         ):
             graph.until(lambda: any(d.data > 0.1 for d in duties), "a duty")

@@ -40,7 +40,6 @@ MODULES = {
     "replay": "aeropend_ident.nodes.replay",
     "watch": "aeropend_ident.nodes.watch",
     "diagnose": "aeropend_ident.commands.diagnose",
-    "investigate": "aeropend_ident.commands.investigate",
 }
 PATIENCE_S = 60.0
 """How long a test waits for what must come: discovery and a first compilation take long on a loaded machine."""

@@ -12,7 +12,7 @@ from aeropend_ident.commands.isolate import main
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.isolation import chance, structure
-from aeropend_ident.diagnosis.isolation.isolate import isolate, judge_of
+from aeropend_ident.diagnosis.isolation.isolate import isolate, judge_of, would_show
 from aeropend_ident.diagnosis.isolation.judge import Judge, Rival, _distinct
 from aeropend_ident.diagnosis.isolation.linear import Column, bounded
 from aeropend_ident.diagnosis.isolation.planned import PlanError, like, planned
@@ -227,9 +227,8 @@ def test_what_would_have_shown_does_and_what_would_not_does_not():
     """Recordings of other rigs and other noise, with twice and with two fifths of the size that is said."""
     duty = Excitation(duration=20.0, duty_max=0.55, seed=8).series()
     read, _ = rig.record(BENCH, duty, 21)
-    nothing = diagnose(BENCH, [from_arrays({**read, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)]).conclusions.which
-    assert nothing.verdict == "none"
-    smallest_of = {w.effect: w.smallest for w in nothing.would_show}
+    nothing = from_arrays({**read, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)
+    smallest_of = {w.effect: w.smallest for w in would_show(BENCH, [nothing])}
     for effect in ("coulomb_friction", "voltage_offset", "ground_effect"):
         verdicts = []
         for factor in (0.4, 2.0):

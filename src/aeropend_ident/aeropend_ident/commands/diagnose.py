@@ -28,7 +28,7 @@ from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.document import Across, DocumentError, Identified
 from aeropend_ident.diagnosis.document import read as read_document
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
-from aeropend_ident.diagnosis.results import FILES, Results, document
+from aeropend_ident.diagnosis.results import FILES, Results, document, with_would_show
 from aeropend_ident.diagnosis.validation import validate
 from aeropend_ident.result_folder import ensure_free, folder_names
 from aeropend_ident.signals.from_bag import signals_of
@@ -222,6 +222,10 @@ def run(options: argparse.Namespace, command: str, rules: Sequence[checks.Rule])
                  for bag, v, s in zip(options.test, its, tests, strict=True)]
         nominal = " and ".join(options.since) or options.model
         made = document(found, options.bags, nominal, time.monotonic() - started, shown)
+        if made.which.verdict == "none" and of_rig is None and not uncalibrated and not options.since:
+            show(1.0, "what would have shown")
+            made = with_would_show(made, found, further, options.material, options.jobs)
+            made = replace(made, seconds=round(time.monotonic() - started, 2))
         results = Results.of(found, made, command)
     results.write(out, overwrite=options.overwrite)
     print("\n".join(results.lines))

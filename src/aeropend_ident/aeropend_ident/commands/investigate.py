@@ -47,6 +47,9 @@ NOT_SURE = 1
 PATIENCE = 10.0
 """[s] Time in which a running rig is found (choice: discovery takes about a second)."""
 
+SETTLED = 3.0
+"""[s] Time in which all publishers are known, after a subscriber is (choice: discovery takes about a second)."""
+
 LOOK = 0.1
 """[s] Time between two looks at the graph (choice)."""
 
@@ -158,6 +161,9 @@ def wait_for_rig(ros: Sequence[str]) -> None:
             time.sleep(LOOK)
         if not node.count_subscribers(topic):
             raise ProgramError(f"no rig listens to {topic}: start a plant or a bridge first")
+        end = time.monotonic() + SETTLED  # who drives it may be discovered after who listens
+        while not node.count_publishers(topic) and time.monotonic() < end:
+            time.sleep(LOOK)
         if node.count_publishers(topic):
             raise ProgramError(f"something drives the rig on {topic} already: stop the controller or the excitation "
                                "first")

@@ -71,6 +71,7 @@ class Investigation:
         self.ended = ""
         """Why there is no further experiment, in a sentence; "" as long as there may be one."""
         self.sure = False
+        self._length = 0.0
         self._open = Open((), {}, 0.0)
         self._found: DiagnosisDocument | None = None
 
@@ -92,6 +93,7 @@ class Investigation:
         best = self.first if self.first is not None and not self.recordings else design(
             rows, goal, self.limits, LENGTH, tries=self.tries, seed=len(self.recordings), jobs=self.jobs,
             progress=progress)
+        self._length = best.excitation.duration
         if not names:
             return Proposal(best, rows, "show any effect, and tell it from the others")
         reached = min(a.reached for a in best.answers)
@@ -102,6 +104,7 @@ class Investigation:
         times = math.ceil(min(max(reached, 1e-3) ** -2, left // LENGTH))
         if times > 1:
             best = prolonged(rows, goal, best, times)
+            self._length = best.excitation.duration
         return Proposal(best, rows, f"tell {' and '.join(names)} apart")
 
     def add(self, recording: Signals, diagnosed: Callable[[Diagnosis], DiagnosisDocument],
@@ -114,7 +117,7 @@ class Investigation:
             progress: of the diagnosis.
         """
         self.recordings.append(recording)
-        self.moved += len(recording) * recording.period
+        self.moved += self._length
         found = diagnose(self.model, self.recordings, self.jobs, progress, further=self.further)
         self._found = diagnosed(found)
         before, self._open = self._open, left_open(self._found)

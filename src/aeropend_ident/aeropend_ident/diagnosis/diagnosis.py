@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.diagnosis import conclude, gap_share, regions, since, typed_json
 from aeropend_ident.diagnosis.chain import static_map
 from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
@@ -49,14 +48,12 @@ from aeropend_ident.diagnosis.document import (
     Residual,
     Where,
     Which,
-    WouldShow,
 )
 from aeropend_ident.diagnosis.document import UnknownEffect as DrawnEffect
 from aeropend_ident.diagnosis.experiment_design import EXPERIMENTS, experiments_within
 from aeropend_ident.diagnosis.free_run_gap import Gap, HeldOut, closure, gap
 from aeropend_ident.diagnosis.gap_budget import Repeats, budget
 from aeropend_ident.diagnosis.gap_share import Part
-from aeropend_ident.diagnosis.isolation.isolate import would_show
 from aeropend_ident.diagnosis.joint_fit import JointFit, fit_jointly
 from aeropend_ident.diagnosis.policy import GOOD_ENOUGH, MATERIAL_SHARE, angle_only, policy_of
 from aeropend_ident.diagnosis.search import gust, onset, speed_spikes, unknown_effect
@@ -501,7 +498,7 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
                     tuple(conclude.names(a, b) for a, b in undecided),
                     conclude.next_experiment(chains.model, found.recordings[0], undecided,
                                              _unlearned(joint.values_of_rig, found.learned), tried, settings.jobs),
-                    _families(head.small), conclude.sets(stages), _would_show(found, head.verdict, settings)),
+                    _families(head.small), conclude.sets(stages)),
         closure=Closure(gaps.before.total, gaps.after.total, gaps.before.total_floor(gaps.floors), closed, low, high,
                         budget=gaps.budget(gust=found.statistical.gust is not None, jobs=settings.jobs)),
         identified=None if calibrated else conclude.identified_model(chains, joint, rows),
@@ -509,17 +506,6 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
         since=None if chains.known is None else since.changes(
             chains.known, joint, found.statistical, head.claimed),
         estimates=None if failed else since.estimates(joint, found.statistical))
-
-
-def _would_show(found: _Findings, verdict: str, settings: Settings) -> tuple[WouldShow, ...]:
-    """What would have shown, where nothing did, on a calibrated rig that is as its model states."""
-    chains = found.chains
-    if verdict != "none" or not chains.policy.calibrated or chains.known is not None:
-        return ()
-    try:
-        return would_show(chains.model, found.recordings, chains.further, settings.material, settings.jobs)
-    except RecordingError:  # too little moves for a plan
-        return ()
 
 
 def _unlearned(values: Mapping[str, float], learned: Learned | None) -> dict[str, float]:

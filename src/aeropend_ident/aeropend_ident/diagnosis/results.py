@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.diagnosis.chain.values import limits
 from aeropend_ident.diagnosis.diagnosis import Diagnosis
 from aeropend_ident.diagnosis.document import (
@@ -26,6 +27,7 @@ from aeropend_ident.diagnosis.document import (
     VariantFound,
     to_json,
 )
+from aeropend_ident.diagnosis.isolation.isolate import would_show
 from aeropend_ident.diagnosis.left_open import design_command
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.diagnosis.report import changes, page, sentence
@@ -136,6 +138,24 @@ def document(diagnosis: Diagnosis, bags: Sequence[str], model: str, seconds: flo
         closure=replace(c.closure, across=tuple(across)), identified=c.identified,
         since=c.since, estimates=c.estimates, variants=c.variants,
         notes=tuple(_notes(signals, bags)), seconds=round(seconds, 2))
+
+
+def with_would_show(document: DiagnosisDocument, diagnosis: Diagnosis, further: Sequence[str], material: float,
+                    jobs: int) -> DiagnosisDocument:
+    """The document of a calibrated rig in which nothing was found, with what would have shown.
+
+    Args:
+        document: of the diagnosis.
+        diagnosis: the diagnosis.
+        further: ids of effects of effect files.
+        material: share of the gap from which an effect is claimed.
+        jobs: threads.
+    """
+    try:
+        found = would_show(diagnosis.model, diagnosis.signals, further, material, jobs)
+    except RecordingError:  # too little moves for a plan
+        return document
+    return replace(document, which=replace(document.which, would_show=found))
 
 
 def _notes(recordings: Sequence[Signals], bags: Sequence[str]) -> Iterator[str]:
