@@ -268,7 +268,7 @@ class Search:
     def differences(self, step: float = STEP) -> dict[str, Sensitivities]:
         """Derivatives of the residuals, by finite differences towards the inside of the bounds."""
         moves = np.where(self.z + step > self.high, -step, step)
-        return self._differences(self.z + moves, None)
+        return self._differences(self.z + moves, None, moves)
 
     def slopes_over(self, sd: Array) -> dict[str, Sensitivities]:
         """Slopes of the residuals from one standard deviation below to one above, for each parameter.
@@ -276,9 +276,10 @@ class Search:
         Args:
             sd: (P,) standard deviations in standard units.
         """
-        return self._differences(np.minimum(self.z + sd, self.high), np.maximum(self.z - sd, self.low))
+        after, before = np.minimum(self.z + sd, self.high), np.maximum(self.z - sd, self.low)
+        return self._differences(after, before, after - before)
 
-    def _differences(self, after: Array, before: Array | None) -> dict[str, Sensitivities]:
+    def _differences(self, after: Array, before: Array | None, moves: Array) -> dict[str, Sensitivities]:
         """Differences of the residuals over those of each parameter, which is moved alone.
 
         A parameter that each recording has a value of its own for is moved in all recordings at once.
@@ -286,8 +287,8 @@ class Search:
         Args:
             after: (P,) value of each parameter where it is moved.
             before: (P,) the same, of the residuals that are subtracted; None: those at this point.
+            moves: (P,) what each parameter is moved by.
         """
-        moves = after - (self.z if before is None else before)
         groups: dict[str, dict[int, int]] = {}
         for j, p in enumerate(self.parameters):
             name = key(p.name)
