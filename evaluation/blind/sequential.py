@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.bags.recording import RecordingError
-from aeropend_ident.design.design import DURATIONS, Designed, design, starts
+from aeropend_ident.design.design import LENGTH, Designed, design, proposed
 from aeropend_ident.design.exchange import Exchange
 from aeropend_ident.design.goals import APART, NOTHING, Separate, any_effect, between
 from aeropend_ident.design.investigation import Investigation
-from aeropend_ident.design.limits import Limits
+from aeropend_ident.design.limits import Limits, Ranges
 from aeropend_ident.design.responses import Rows, asked
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.isolation.planned import planned
@@ -58,6 +58,27 @@ EFFECTS = tuple(e for e in plant.EFFECTS if e not in RANDOM)
 
 
 @dataclass(frozen=True)
+class Moved:
+    """What a rig did: its parameters, states, voltage and duty; see `plant.states`."""
+
+    p: Array
+    y: Array
+    v: Array
+    duty: Array
+
+    @property
+    def reach(self) -> Ranges:
+        """What the true states reached."""
+        states = {"theta": plant.S.theta, "omega": plant.S.omega, "i_a": plant.S.i}
+        return {c: (float(self.y[:, j].min()), float(self.y[:, j].max())) for c, j in states.items()}
+
+    def recorded(self, model: Model, rng: np.random.Generator) -> Signals:
+        """The recording of it."""
+        columns = plant.measured(self.p, self.y, self.v, model.sensing, rng)
+        return from_arrays({**columns, "duty": self.duty}, plant.PERIOD, model.sensing)
+
+
+@dataclass(frozen=True)
 class Rig:
     """A rig of the independent plant.
 
@@ -69,17 +90,10 @@ class Rig:
     numbers: Mapping[str, float]
     effects: Mapping[str, Mapping[str, float]]
 
-    def moves(self, model: Model, duty: Array) -> tuple[Array, Array, Array]:
-        """States, voltage and duty; see `plant.states`."""
+    def moved(self, model: Model, duty: Array) -> Moved:
+        """What it does under a signal."""
         p = plant.packed(self.numbers, model.sensing["angle_filter_tau"], self.effects, {}, 0)
-        return plant.states(p, duty, np.zeros(0))
-
-    def recorded(self, model: Model, duty: Array, rng: np.random.Generator) -> Signals:
-        """The recording of a signal."""
-        p = plant.packed(self.numbers, model.sensing["angle_filter_tau"], self.effects, {}, 0)
-        y, v, applied = plant.states(p, duty, np.zeros(0))
-        return from_arrays({**plant.measured(p, y, v, model.sensing, rng), "duty": applied}, plant.PERIOD,
-                           model.sensing)
+        return Moved(p, *plant.states(p, duty, np.zeros(0)))
 
 
 def drawn_rig(model: Model, effects: Mapping[str, Mapping[str, float]], rng: np.random.Generator) -> Rig:
@@ -116,9 +130,8 @@ def crossed(k: int, seed: int) -> tuple[int, float]:
     beyond = 0
     for _ in range(DRAWN):
         e = str(rng.choice([*EFFECTS, ""]))
-        y, _, _ = drawn_rig(model, {e: of_size(e, rng.uniform(0.0, 1.0))} if e else {}, rng).moves(model, duty)
-        states = {"theta": plant.S.theta, "omega": plant.S.omega, "i_a": plant.S.i}
-        beyond += limits.crossed({c: (y[:, j].min(), y[:, j].max()) for c, j in states.items()})
+        rig = drawn_rig(model, {e: of_size(e, rng.uniform(0.0, 1.0))} if e else {}, rng)
+        beyond += limits.crossed(rig.moved(model, duty).reach)
     return beyond, -limits.excess(found.reach)
 
 
@@ -181,8 +194,7 @@ def closest(model: Model) -> dict[str, list[str]]:
 
 def best_before(rows: Rows, goal: Separate, seconds: float) -> tuple[Excitation, float]:
     """The best signal of `diagnose`, within the limits, and its smallest distance."""
-    begun = Exchange(rows, goal, LIMITS).begin(
-        {n: h for n, h in starts(seconds, LIMITS, 0).items() if not n.startswith("random")})
+    begun = Exchange(rows, goal, LIMITS).begin(proposed(seconds, LIMITS))
     best = max(begun.values(), key=lambda t: t.score)
     return best.holds.excitation, min(a.value for a in best.answers)
 
@@ -190,7 +202,7 @@ def best_before(rows: Rows, goal: Separate, seconds: float) -> tuple[Excitation,
 def _named(rig: Rig, model: Model, signal: Excitation, rng: np.random.Generator, names: tuple[str, str]) -> bool:
     """Whether the diagnosis of a recording names the first of two effects, and not the other beside it."""
     try:
-        which = diagnose(model, [rig.recorded(model, signal.series(), rng)]).conclusions.which
+        which = diagnose(model, [rig.moved(model, signal.series()).recorded(model, rng)]).conclusions.which
     except RecordingError:  # a constant duty
         return False
     return which.verdict == names[0] and not any(set(names) <= set(p) for p in which.not_separable)
@@ -240,10 +252,9 @@ def investigated(k: int, effect: str, seed: int, first: Designed) -> Investigate
     inquiry = Investigation(model, template(model), LIMITS, MOST, tries=TRIES, first=first)
     beyond, verdict = False, ""
     while (proposal := inquiry.next()) is not None:
-        duty = proposal.designed.excitation.series()
-        y, _, _ = rig.moves(model, duty)
-        beyond |= not LIMITS.theta[0] <= y[:, plant.S.theta].min() <= y[:, plant.S.theta].max() <= LIMITS.theta[1]
-        found = inquiry.add(rig.recorded(model, duty, rng),
+        moved = rig.moved(model, proposal.designed.excitation.series())
+        beyond |= LIMITS.crossed(moved.reach)
+        found = inquiry.add(moved.recorded(model, rng),
                             lambda d: document(d, ["bag"] * len(inquiry.recordings), folder.MODEL, 0.0))
         verdict = found.conclusions.which.verdict
     return Investigated(effect, inquiry.sure, verdict, inquiry.moved, plain.verdict, not plain.not_separable, beyond)
@@ -293,7 +304,7 @@ def report(count: int, seed: int, duration: float, jobs: int) -> list[score.Figu
     for p in pairs:
         print(f"{p.effect:22} {p.rival:22} {p.seconds:5.0f} s  told apart: {p.named}")
     rows = Rows(model, template(model), asked(model))
-    first = design(rows, any_effect(rows, list(rows.effects)), LIMITS, DURATIONS[2], jobs=jobs)
+    first = design(rows, any_effect(rows, list(rows.effects)), LIMITS, LENGTH, jobs=jobs)
     rigs = folder.each("one after another", effects, lambda k, e: investigated(k, e, seed, first), jobs)
     for r in rigs:
         print(f"{r.effect:22} {r.moved:4.0f} s  {'sure' if r.sure else '-   '}  {r.verdict:22} "

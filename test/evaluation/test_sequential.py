@@ -29,7 +29,8 @@ def test_a_rig_of_the_plant_that_goes_too_far_is_counted(monkeypatch):
 
 def test_an_effect_of_the_plant_is_recorded():
     duty = Excitation(duration=8.0, seed=2).series()
-    recordings = [drawn_rig(BENCH, effects, np.random.default_rng(4)).recorded(BENCH, duty, np.random.default_rng(5))
+    recordings = [drawn_rig(BENCH, effects, np.random.default_rng(4)).moved(BENCH, duty).recorded(
+        BENCH, np.random.default_rng(5))
                   for effects in ({}, {"angle_offset": of_size("angle_offset", 1.0)})]
     assert np.nanmean(recordings[1].theta - recordings[0].theta) == pytest.approx(0.06, abs=0.01)
 

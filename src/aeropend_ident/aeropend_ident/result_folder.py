@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder with the results of a command: its name, and writing it completely or not at all."""
+"""The results of a command: a folder that is written completely or not at all, its name, and single files."""
 
 from __future__ import annotations
 
@@ -36,6 +36,37 @@ def ensure_free(out: Path, files: Sequence[str], *, overwrite: bool) -> None:
     taken = [name for name in files if (out / name).exists()]
     if taken and not overwrite:
         raise OutputError(f"{out}: holds {taken[0]} already; give another --out, or --overwrite to replace it")
+
+
+def ensure_new(file: Path, option: str, *, overwrite: bool) -> None:
+    """Make sure before the work that a file can be written.
+
+    Args:
+        file: the file.
+        option: that names it.
+        overwrite: whether it may be replaced.
+
+    Raises:
+        OutputError: it is there already.
+    """
+    if file.exists() and not overwrite:
+        raise OutputError(f"{file}: is there already; give another {option}, or --overwrite to replace it")
+
+
+def write_page(file: Path, text: str) -> None:
+    """Write the page of `--html`.
+
+    Args:
+        file: the page.
+        text: its content.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    try:
+        file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{file}: cannot be written: {error.strerror}; give another --html") from None
 
 
 def folder_names(bags: Sequence[str], taken: Iterable[str] = ()) -> list[str]:

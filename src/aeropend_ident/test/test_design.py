@@ -132,6 +132,15 @@ def test_a_signal_gets_no_longer_than_is_needed(rows):
     assert all(a.reached >= 1.0 for a in found.answers)
 
 
+@pytest.mark.parametrize("low", [-0.5, 0.0])
+@pytest.mark.parametrize("least", [-0.6, -0.01, 0.0])
+@pytest.mark.parametrize("greatest", [0.9, 1.1])
+def test_what_exceeds_a_limit_crosses_it(low, least, greatest):
+    limits = Limits(theta=(low, 1.0))
+    reach = {"theta": (least, greatest), "omega": (0.0, 9.0), "i_a": (0.0, 9.0)}
+    assert (limits.excess(reach) > 0.0) == limits.crossed(reach)
+
+
 @given(st.integers(0, 2**32 - 1))
 def test_a_change_keeps_length_grid_and_limits(seed):
     rng = np.random.default_rng(seed)

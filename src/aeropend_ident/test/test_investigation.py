@@ -4,7 +4,8 @@
 import pytest
 
 from aeropend_ident.commands.investigate import main
-from aeropend_ident.design.investigation import LENGTH, Investigation
+from aeropend_ident.design.design import LENGTH
+from aeropend_ident.design.investigation import Investigation
 from aeropend_ident.design.limits import Limits
 from aeropend_ident.diagnosis.isolation.planned import planned
 from aeropend_ident.diagnosis.results import document

@@ -234,8 +234,7 @@ def test_what_would_have_shown_does_and_what_would_not_does_not():
         for factor in (0.4, 2.0):
             e = DEFINED[effect]
             size = e.parameters[e.size]
-            own = {n: p.neutral if p.refines else p.default for n, p in e.parameters.items()}
-            own[e.size] = size.neutral + factor * smallest_of[effect]
+            own = {**e.defaults, e.size: size.neutral + factor * smallest_of[effect]}
             read, _ = rig.record(BENCH.with_effects({effect: own}), duty, 22)
             recording = from_arrays({**read, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)
             verdicts.append(diagnose(BENCH, [recording]).conclusions.which.verdict)

@@ -18,7 +18,7 @@ from rich.table import Table
 
 from aeropend_ident.commands.isolate import sizes_of
 from aeropend_ident.design import page
-from aeropend_ident.design.design import Designed, design
+from aeropend_ident.design.design import LENGTH, Designed, design
 from aeropend_ident.design.goals import NOTHING, Answer, Goal, Numbers, any_effect, between
 from aeropend_ident.design.limits import Limits
 from aeropend_ident.design.responses import Rows, asked
@@ -26,7 +26,7 @@ from aeropend_ident.diagnosis import document, typed_json
 from aeropend_ident.diagnosis.isolation.planned import PlanError, planned
 from aeropend_ident.diagnosis.left_open import Open, as_refitted, left_open
 from aeropend_ident.diagnosis.report.number_format import plain, plain_quantity
-from aeropend_ident.result_folder import OutputError
+from aeropend_ident.result_folder import ensure_new, write_page
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import CHANNELS
 from aeropend_sim.cli.command import EXIT_CODES, Parser, called, entry_point, own
@@ -52,9 +52,6 @@ of the effects, until the arm has fallen back after the end.
 
 {EXIT_CODES}"""
 
-LENGTH = 20.0
-"""[s] Length of an experiment if none is given (choice)."""
-
 SHORTEST, LONGEST = 5.0, 120.0
 """[s] Lengths that may be asked for.
 
@@ -71,13 +68,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
     arguments = own(arguments)
     options = parse(arguments)
-    further = tuple(id_ for file in options.effects for id_ in effect_file.load(file))
+    further = effect_file.load_all(options.effects)
     limits = limits_of(options)
     out = Path(options.out)
     html = Path(options.html) if options.html else None
-    for file in (out, html):
-        if file is not None and file.exists() and not options.overwrite:
-            raise OutputError(f"{file}: is there already; give another name, or --overwrite to replace it")
+    ensure_new(out, "--out", overwrite=options.overwrite)
+    if html is not None:
+        ensure_new(html, "--html", overwrite=options.overwrite)
     model, sizes, open_ = load(options.model), sizes_of(options.size), Open((), {}, 0.0)
     if options.verdict:
         found = document.read(Path(options.verdict) / "diagnosis.json")
@@ -96,10 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = shlex.join(["design", *arguments])
     excitation_file.save(best.excitation, out, f"Written by: {command}\n{'; '.join(reach_lines(best))}")
     if html is not None:
-        try:
-            html.write_text(page.render(best, rows, command, out.name), encoding="utf-8")
-        except OSError as error:
-            raise OutputError(f"{html}: cannot be written: {error.strerror}; give another --html") from None
+        write_page(html, page.render(best, rows, command, out.name))
     if options.json:
         print(json.dumps(typed_json.to_json(best), indent=1, ensure_ascii=False))
     else:

@@ -165,15 +165,6 @@ def identified_with(model: Path) -> Identified | None:
         return None
 
 
-def effects_of(files: Sequence[str]) -> tuple[str, ...]:
-    """Ids of the effects of effect files, which are then known to models.
-
-    Raises:
-        EffectError: a file cannot be read, or a definition in it cannot be used.
-    """
-    return tuple(id_ for file in files for id_ in effect_file.load(file))
-
-
 def run(options: argparse.Namespace, command: str, rules: Sequence[checks.Rule]) -> list[checks.Outcome]:
     """Diagnose recordings of one rig together and write the results.
 
@@ -186,7 +177,7 @@ def run(options: argparse.Namespace, command: str, rules: Sequence[checks.Rule])
     started = time.monotonic()
     out = Path(options.out or f"diagnosis_{folder_names(options.bags[:1], [batch.SUMMARY])[0]}")
     ensure_free(out, FILES, overwrite=options.overwrite)
-    known, uncalibrated, further = None, options.fit_nominal, effects_of(options.effects)
+    known, uncalibrated, further = None, options.fit_nominal, effect_file.load_all(options.effects)
     if options.since:
         model, known, verdicts = since.read([Path(folder) for folder in options.since])
         of_rig = verdicts[-1].identified
@@ -250,7 +241,7 @@ def run_each(options: argparse.Namespace, rules: Sequence[checks.Rule]) -> list[
     ensure_free(out, (batch.SUMMARY,), overwrite=options.overwrite)
     for name in names:
         ensure_free(out / name, FILES, overwrite=options.overwrite)
-    further, model = effects_of(options.effects), load(options.model)
+    further, model = effect_file.load_all(options.effects), load(options.model)
     settings = batch.Settings(model, options.model, options.namespace, options.held_out, options.fit_nominal,
                               options.material, options.seconds, further,
                               effect_file.definitions([*further, *model.effects]))
@@ -324,7 +315,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
     arguments = own(arguments)
     options = parse(arguments)
-    effects_of(options.effects)
+    effect_file.load_all(options.effects)
     rules = [checks.parse(text) for text in options.fail_on]
     junit = Path(options.junit) if options.junit else None
     try:

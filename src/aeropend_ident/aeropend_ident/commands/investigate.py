@@ -23,19 +23,20 @@ from rclpy.node import Node
 from rich.console import Console
 
 from aeropend_ident.commands.design import add_limits, limits_of, reach_lines
-from aeropend_ident.commands.diagnose import effects_of
 from aeropend_ident.commands.programs import ProgramError, made, record_excited
 from aeropend_ident.design import page
-from aeropend_ident.design.investigation import LENGTH, Investigation, Proposal
+from aeropend_ident.design.design import LENGTH
+from aeropend_ident.design.investigation import Investigation, Proposal
 from aeropend_ident.diagnosis.diagnosis import Diagnosis
 from aeropend_ident.diagnosis.document import DiagnosisDocument
 from aeropend_ident.diagnosis.isolation.planned import planned
 from aeropend_ident.diagnosis.results import Results, document, verdict_lines
+from aeropend_ident.result_folder import write_page
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import CHANNELS
 from aeropend_sim.cli.command import Parser, between, entry_point, own
 from aeropend_sim.cli.progress import Show, progress
-from aeropend_sim.model import excitation_file
+from aeropend_sim.model import effect_file, excitation_file
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import PRESETS, load
 from aeropend_sim.ros import interface
@@ -73,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt()))
     if not options.yes and not sys.stdin.isatty():
         raise ProgramError("it asks before each experiment, and there is no terminal: give --yes if nobody need agree")
-    further, limits, model = effects_of(options.effects), limits_of(options), load(options.model)
+    further, limits, model = effect_file.load_all(options.effects), limits_of(options), load(options.model)
     console, command = Console(stderr=True), shlex.join(["investigate", *arguments])
     wait_for_rig(ros)
     folder = Path(options.out or f"investigation_{datetime.now():%Y%m%d-%H%M%S}")
@@ -181,7 +182,7 @@ def announce(proposal: Proposal, place: Path, command: str) -> None:
     """
     best = proposal.designed
     excitation_file.save(best.excitation, place / "experiment.yaml", f"{command}: to {proposal.why}")
-    (place / "experiment.html").write_text(page.render(best, proposal.rows, command, "experiment.yaml"), "utf-8")
+    write_page(place / "experiment.html", page.render(best, proposal.rows, command, "experiment.yaml"))
     x = best.excitation
     print(printable(f"experiment {place.name}: {x.duration:g} s, to {proposal.why}"))
     for line in (f"duty {min(x.sequence):g} to {max(x.sequence):g}", *reach_lines(best)):

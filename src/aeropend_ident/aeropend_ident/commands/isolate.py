@@ -24,7 +24,7 @@ from aeropend_ident.diagnosis.isolation.isolate import Isolation, Sensor, isolat
 from aeropend_ident.diagnosis.isolation.planned import PlanError, like, planned
 from aeropend_ident.diagnosis.report import isolation as page
 from aeropend_ident.diagnosis.report.number_format import plain_quantity
-from aeropend_ident.result_folder import OutputError
+from aeropend_ident.result_folder import ensure_new, write_page
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import CHANNELS
 from aeropend_sim.cli.command import EXIT_CODES, Parser, between, entry_point, own
@@ -64,12 +64,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
     arguments = own(arguments)
     options = parse(arguments)
-    further = tuple(id_ for file in options.effects for id_ in effect_file.load(file))
+    further = effect_file.load_all(options.effects)
     model = load(options.model)
     sizes = sizes_of(options.size)
     html = Path(options.html) if options.html else None
-    if html is not None and html.exists() and not options.overwrite:
-        raise OutputError(f"{html}: is there already; give another --html, or --overwrite to replace it")
+    if html is not None:
+        ensure_new(html, "--html", overwrite=options.overwrite)
     with progress("reading") as show:
         if options.bag:
             signals = signals_of(options.bag, options.namespace, model)
@@ -82,10 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                         sensors=not options.no_sensors, jobs=options.jobs,
                         progress=lambda what, share: show(share, what))
     if html is not None:
-        try:
-            html.write_text(page.render(found, shlex.join(["isolate", *arguments])), encoding="utf-8")
-        except OSError as error:
-            raise OutputError(f"{html}: cannot be written: {error.strerror}; give another --html") from None
+        write_page(html, page.render(found, shlex.join(["isolate", *arguments])))
     if options.json:
         print(json.dumps(typed_json.to_json(found), indent=1, ensure_ascii=False))
     else:

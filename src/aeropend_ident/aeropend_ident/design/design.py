@@ -17,6 +17,9 @@ from aeropend_sim.model.excitation import Excitation
 Progress = Callable[[str, float], None]
 """Called with the present step and the share (0 to 1) of the work that is done."""
 
+LENGTH = 20.0
+"""[s] Length of an experiment if none is given (choice: the search of a longer one takes long)."""
+
 DURATIONS = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0)
 """[s] Lengths that are tried in turn until all that is asked is reached (choice)."""
 
@@ -33,9 +36,6 @@ DRAWS = 1000
 
 DOWN = 0.98
 """Factor on the duties after a drawn rig crossed a limit (choice)."""
-
-RANDOM = "random"
-"""Name of the starts that `diagnose` does not propose (convention)."""
 
 LEAST_MOTION = 0.05
 """Factor on the duties below which no signal is left (choice)."""
@@ -64,23 +64,22 @@ class Designed:
     answers_before: tuple[Answer, ...]
 
 
-def starts(seconds: float, limits: Limits, seed: int) -> dict[str, Holds]:
-    """Signals from which a search starts: those that `diagnose` proposes, and random holds, fast and slow.
+def proposed(seconds: float, limits: Limits) -> dict[str, Holds]:
+    """The signals that `diagnose` proposes, by number and kind; not those that are no holds.
 
     Args:
         seconds: length.
         limits: of the duty.
-        seed: of the random ones.
     """
-    found = {}
-    for k, e in enumerate(EXPERIMENTS, 1):
-        if e.kind != "multisine":
-            found[f"{k} {e.kind}"] = of_series(replace(e, duration=seconds).series(), limits)
-    for k, longest in enumerate((0.5, 1.0, 2.0, 4.0)):
-        e = Excitation("latin_hypercube", seconds, seed + k, duty_max=max(limits.duty[1], 0.02), hold_min=0.1,
-                       hold_max=longest, rest=longest)
-        found[f"{RANDOM} {k}"] = of_series(e.series(), limits)
-    return found
+    return {f"{k} {e.kind}": of_series(replace(e, duration=seconds).series(), limits)
+            for k, e in enumerate(EXPERIMENTS, 1) if e.kind != "multisine"}
+
+
+def random_holds(seconds: float, limits: Limits, seed: int) -> dict[str, Holds]:
+    """Random signals, fast and slow, from which a search starts too; arguments as of `proposed`, and a seed."""
+    drawn = [Excitation("latin_hypercube", seconds, seed + k, duty_max=max(limits.duty[1], 0.02), hold_min=0.1,
+                        hold_max=longest, rest=longest) for k, longest in enumerate((0.5, 1.0, 2.0, 4.0))]
+    return {f"random {k}": of_series(e.series(), limits) for k, e in enumerate(drawn)}
 
 
 def design(rows: Rows, goal: Goal, limits: Limits, seconds: float | None = None, *, tries: int | None = None,
@@ -102,7 +101,8 @@ def design(rows: Rows, goal: Goal, limits: Limits, seconds: float | None = None,
     """
     exchange = Exchange(rows, goal, limits, jobs)
     for length in DURATIONS if seconds is None else (seconds,):
-        begun = exchange.begin(starts(length, limits, seed))
+        known = proposed(length, limits)
+        begun = exchange.begin({**known, **random_holds(length, limits, seed)})
         if not begun:
             raise LimitError("no signal keeps the limits on every rig within the uncertainty: even 5 % of the duties "
                              "exceed one of them; allow more")
@@ -115,7 +115,7 @@ def design(rows: Rows, goal: Goal, limits: Limits, seconds: float | None = None,
             break
     progress("limits", 0.0)
     safe = _checked(exchange, best, seed)
-    before = max((name for name in begun if not name.startswith(RANDOM)), key=lambda n: begun[n].score, default="")
+    before = max((name for name in begun if name in known), key=lambda n: begun[n].score, default="")
     return Designed(safe.holds.excitation, safe.answers, limits, safe.reach, DRAWS, before,
                     begun[before].answers if before else ())
 

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from aeropend_ident.design.design import Designed, design, prolonged
+from aeropend_ident.design.design import LENGTH, Designed, design, prolonged
 from aeropend_ident.design.goals import any_effect, between
 from aeropend_ident.design.limits import Limits
 from aeropend_ident.design.responses import Rows, asked
@@ -22,9 +22,6 @@ from aeropend_sim.model.parameters import Model
 
 Progress = Callable[[str, float], None]
 """Called with the present step and the share (0 to 1) of the work that is done."""
-
-LENGTH = 20.0
-"""[s] Length of an experiment; a longer one repeats it (choice: the search of a longer one takes long)."""
 
 CHANGED = 0.7
 """Factor on a rival's probability above which an experiment for it has changed nothing (choice)."""

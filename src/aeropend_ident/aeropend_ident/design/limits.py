@@ -76,8 +76,8 @@ class Limits:
                 worst = max(worst, greatest / high - 1.0)
             if math.isfinite(low) and low < 0.0:
                 worst = max(worst, least / low - 1.0)
-            elif low == 0.0:
-                worst = max(worst, -least / high - 1.0)
+            elif low == 0.0 and least < 0.0:
+                worst = max(worst, -least / high)
         return worst
 
     def crossed(self, reach: Ranges) -> bool:

@@ -8,7 +8,7 @@ products (Gram matrix), so that each question about it is small linear algebra.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from aeropend_ident.design.limits import LimitError, Ranges, reach_of
 from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD, SIZE_SD, TOLERANCE, usual_size
-from aeropend_ident.diagnosis.experiment_design import PlannedReadings
+from aeropend_ident.diagnosis.experiment_design import PlannedReadings, unread
 from aeropend_ident.diagnosis.free_run_gap import free_run
 from aeropend_ident.diagnosis.search.hypotheses import MISMATCH_SD, hypotheses
 from aeropend_ident.estimation.parameter import Parameter
@@ -48,12 +48,14 @@ class Asked:
     Attributes:
         name: of the hypothesis: an effect, or `parameter_mismatch:K_t`.
         size: as a distance from the neutral one, with its sign; for a parameter the relative change.
-        values: with this size.
+        usual: size, as `size`.
+        values: with the size.
         further: other parameters of the effect.
     """
 
     name: str
     size: float
+    usual: float
     values: Mapping[str, float]
     further: tuple[Parameter, ...] = ()
 
@@ -72,10 +74,11 @@ def asked(model: Model, further: Sequence[str] = (), sizes: Mapping[str, float] 
     found = {}
     for h in hypotheses(model, further):
         if h.parameter:
-            found[h.name] = Asked(h.name, MISMATCH_SD, {h.parameter: (1.0 + MISMATCH_SD) * model.model[h.parameter]})
+            found[h.name] = Asked(h.name, MISMATCH_SD, MISMATCH_SD,
+                                  {h.parameter: (1.0 + MISMATCH_SD) * model.model[h.parameter]})
         elif h.effect not in RANDOM:
             effect = DEFINED[h.effect]
-            own = {f"{effect.id}.{n}": p.neutral if p.refines else p.default for n, p in effect.parameters.items()}
+            own = {f"{effect.id}.{n}": x for n, x in effect.defaults.items()}
             neutral = effect.parameters[effect.size].neutral
             usual = usual_size(h.effect, model) - neutral
             size = float(np.copysign((sizes or {}).get(h.effect, abs(usual)), usual))
@@ -83,7 +86,7 @@ def asked(model: Model, further: Sequence[str] = (), sizes: Mapping[str, float] 
                 most = (h.own[0].high - neutral) if usual > 0.0 else (neutral - h.own[0].low)
                 raise LimitError(f"{h.effect} of {abs(size):g} is no size that it may have: give at most {most:g}")
             values = {**own, h.own[0].name: neutral + size}
-            found[h.name] = Asked(h.name, size, values, tuple(p for p in h.own[1:]))
+            found[h.name] = Asked(h.name, size, usual, values, h.own[1:])
     return found
 
 
@@ -101,12 +104,11 @@ class Rows:
         self.numbers = {n: NOMINAL_SD * abs(model.model[n]) for n in MODEL_NAMES if model.model[n] != 0.0}
         self.effects = {name: e for name, e in effects.items() if not name.partition(":")[2]}
         self.names = [*self.numbers, *self.effects]
-        self.further = {name: tuple(range(at, at + len(e.further))) for (name, e), at in zip(
-            self.effects.items(), np.cumsum([0, *(len(e.further) for e in self.effects.values())])
-            + len(self.names), strict=False)}
+        ends = len(self.names) + np.cumsum([len(e.further) for e in self.effects.values()])
+        self.further = {name: tuple(range(end - len(e.further), end))
+                        for (name, e), end in zip(self.effects.items(), ends.tolist(), strict=True)}
         self.background = np.concatenate([np.ones(len(self.numbers)), [
-            IMPERFECTION * abs(usual_size(n, model) - DEFINED[n].parameters[DEFINED[n].size].neutral) / abs(e.size)
-            for n, e in self.effects.items()]])
+            IMPERFECTION * abs(e.usual / e.size) for e in self.effects.values()]])
         """(K,) Standard deviation of each number and effect that is not asked for, in units of its row."""
 
     def index(self, name: str) -> int:
@@ -117,9 +119,7 @@ class Rows:
         """Standard deviation of a hypothesis that is fitted, in units of its row."""
         if parameter := name.partition(":")[2]:
             return MISMATCH_SD * abs(self.model.model[parameter]) / self.numbers[parameter]
-        effect = DEFINED[name]
-        usual = usual_size(name, self.model) - effect.parameters[effect.size].neutral
-        return SIZE_SD * abs(usual / self.effects[name].size)
+        return SIZE_SD * abs(self.effects[name].usual / self.effects[name].size)
 
     def under(self, duty: Array) -> Responses:
         """The responses to a duty signal.
@@ -188,10 +188,7 @@ def after(signals: Signals, duty: Array, tail: float = TAIL) -> Signals:
         duty: (N,).
         tail: [s] that time.
     """
-    duty = np.concatenate([duty, np.zeros(round(tail / SAMPLE_PERIOD))])
-    nothing = np.full(len(duty), np.nan)
-    return replace(signals, period=SAMPLE_PERIOD, duty=duty, theta=nothing, omega=nothing, i_a=nothing, v_a=nothing,
-                   pulses=None, false_speed=np.zeros(len(duty), dtype=bool), train=len(duty))
+    return unread(signals, np.concatenate([duty, np.zeros(round(tail / SAMPLE_PERIOD))]))
 
 
 def _unsure(base: Readings, others: Sequence[Readings]) -> Readings:

@@ -170,6 +170,18 @@ def distances(model: Model, signals: Signals, first: Named, rivals: Sequence[Nam
     return found
 
 
+def unread(signals: Signals, duty: Array) -> Signals:
+    """A recording of a duty signal (N,) without readings.
+
+    Args:
+        signals: a recording of the rig.
+        duty: held for one `SAMPLE_PERIOD` each.
+    """
+    nothing = np.full(len(duty), np.nan)
+    return replace(signals, period=SAMPLE_PERIOD, duty=duty, theta=nothing, omega=nothing, i_a=nothing, v_a=nothing,
+                   pulses=None, false_speed=np.zeros(len(duty), dtype=bool), train=len(duty))
+
+
 @dataclass(frozen=True)
 class PlannedReadings:
     """The readings of a recording that a duty signal would give.
@@ -197,11 +209,8 @@ class PlannedReadings:
             duty: (N,) held for one `SAMPLE_PERIOD` each.
             values: give the pulses of the speed.
         """
-        nothing = np.full(len(duty), np.nan)
-        plan = replace(signals, period=SAMPLE_PERIOD, duty=duty, theta=nothing, omega=nothing, i_a=nothing,
-                       v_a=nothing, pulses=None, false_speed=np.zeros(len(duty), dtype=bool), train=len(duty))
         shown = {c: np.arange(len(duty)) for c in CHANNELS if signals.has(c)}
-        planned = cls(model, plan, shown, _noise(signals))
+        planned = cls(model, unread(signals, duty), shown, _noise(signals))
         if signals.pulses is not None:  # the speed is read once a pulse
             turn = 2.0 * math.pi / model.sensing["speed_pulses_per_rev"]
             angle = np.cumsum(planned.run(values or {})["omega"]) * SAMPLE_PERIOD

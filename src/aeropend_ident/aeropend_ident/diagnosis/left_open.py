@@ -64,7 +64,7 @@ def as_refitted(model: Model, document: DiagnosisDocument) -> Model:
     sure = {}
     for c in document.which.candidates:
         if c.found and c.law in DEFINED and c.effect not in (*open_, *RANDOM, PARAMETER_MISMATCH):
-            rest = {n: p.neutral if p.refines else p.default for n, p in DEFINED[c.law].parameters.items()}
+            rest = DEFINED[c.law].defaults
             sure[c.law] = {**rest, **{n: x.value for n, x in c.parameters.items() if n in rest}}
     return replace(model, model={**model.model, **numbers}).with_effects({**model.effects, **sure})
 

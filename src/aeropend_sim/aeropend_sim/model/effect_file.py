@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import yaml
@@ -60,6 +60,11 @@ def load(path: str | Path) -> dict[str, Effect]:
         EffectError: it cannot be read, or a definition cannot be used.
     """
     return define(yaml_file.read(path, "an effect file", EffectError), str(path))
+
+
+def load_all(paths: Iterable[str | Path]) -> tuple[str, ...]:
+    """Ids of the effects of effect files, which are then known to models of this process; errors as of `load`."""
+    return tuple(id_ for path in paths for id_ in load(path))
 
 
 def define(tree: object, where: str) -> dict[str, Effect]:

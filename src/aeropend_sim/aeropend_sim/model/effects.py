@@ -92,6 +92,11 @@ class Effect:
         """Name of the parameter that is the size of the effect."""
         return next(iter(self.parameters))
 
+    @property
+    def defaults(self) -> dict[str, float]:
+        """Name of each parameter -> its default; of one that refines the effect the neutral value."""
+        return {name: p.neutral if p.refines else p.default for name, p in self.parameters.items()}
+
 
 P = EffectParameter
 

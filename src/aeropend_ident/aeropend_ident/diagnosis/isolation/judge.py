@@ -96,7 +96,7 @@ class Truth:
     def values(self, size: float) -> dict[str, float]:
         """Values with a size, as a distance from the neutral one; other parameters at their defaults."""
         effect = DEFINED[self.hypothesis.effect]
-        own = {f"{effect.id}.{n}": p.neutral if p.refines else p.default for n, p in effect.parameters.items()}
+        own = {f"{effect.id}.{n}": x for n, x in effect.defaults.items()}
         return {**own, self.size.name: self.size.mean + math.copysign(size, self.usual)}
 
 

@@ -276,18 +276,22 @@ def compared(chains: CutChains, findings: Findings, nominal: Sequence[Parameter]
         candidates: effects that may be members of a set.
         pool: threads.
     """
-    for _ in range(SWAPS):
+    for left in reversed(range(SWAPS + 1)):
         linear = LinearStage(chains, findings, nominal, candidates)
-        swaps = _swaps(linear, pool) if len(findings.found) > 1 else []
+        beside = [_beside(linear, m) for m in linear.found] if len(linear.found) > 1 else []
+        swaps = _swaps(linear, beside, pool)
         best = max(swaps, key=lambda s: s.gain, default=None)
-        if best is None or best.gain <= LEAST:
+        if best is None or best.gain <= LEAST or not left:
             break
         first = RankedHypothesis(best.member.hypothesis, best.fit, findings.found[best.place][0].gain + best.gain, 1.0)
         found = [(replace(s[0], fit=best.fit), *s[1:]) for s in findings.found]
         found[best.place] = (first, *findings.found[best.place])
         findings = replace(findings, final=best.fit, found=tuple(found))
-    found = [_ranked(linear, k, selection, swaps) for k, selection in enumerate(findings.found)]
-    return replace(findings, found=tuple(found), sets=_likely_sets(linear, swaps))
+    if beside:
+        findings = replace(findings, found=tuple(_ranked(selection, b, [s for s in swaps if s.place == k])
+                                                 for k, (selection, b) in enumerate(zip(findings.found, beside,
+                                                                                        strict=True))))
+    return replace(findings, sets=_likely_sets(linear, swaps))
 
 
 class _Swap(NamedTuple):
@@ -306,16 +310,41 @@ class _Swap(NamedTuple):
     fit: Fit
 
 
-def _swaps(linear: LinearStage, pool: ThreadPoolExecutor) -> list[_Swap]:
+class _Beside(NamedTuple):
+    """What the linear model says of an effect and of its rivals beside the other effects.
+
+    Attributes:
+        loss: log evidence without the effect over that with it.
+        rivals: of each family that is not in the set the best member, and what is predicted with it, the best first.
+        gains: log evidence with each of these over that with the effect.
+    """
+
+    loss: float
+    rivals: list[tuple[Member, Predicted]]
+    gains: list[float]
+
+
+def _beside(linear: LinearStage, mine: Member) -> _Beside:
+    """What could stand in the place of an effect that was found."""
+    others = tuple(m for m in linear.found if m is not mine)
+    here = linear.predicted(linear.found).log_evidence
+    taken = {m.hypothesis.family for m in linear.found}
+    best: dict[str, tuple[Member, Predicted]] = {}
+    for m in linear.options:
+        there, family = linear.predicted((*others, m)), m.hypothesis.family
+        if family not in taken and there.log_evidence > (best[family][1].log_evidence if family in best else -np.inf):
+            best[family] = m, there
+    rivals = sorted(best.values(), key=lambda r: -r[1].log_evidence)
+    return _Beside(linear.predicted(others).log_evidence - here, rivals, [t.log_evidence - here for _, t in rivals])
+
+
+def _swaps(linear: LinearStage, beside: Sequence[_Beside], pool: ThreadPoolExecutor) -> list[_Swap]:
     """For each effect found its closest rivals, fitted beside the others."""
     begun = []
-    for k, mine in enumerate(linear.found):
-        others = tuple(m for m in linear.found if m is not mine)
-        here, none = linear.predicted(linear.found).log_evidence, linear.predicted(others).log_evidence
-        rivals = sorted(_best_of_families(linear, others), key=lambda r: -r[1].log_evidence)
-        for j, (m, there) in enumerate(rivals):
-            close = there.log_evidence - none > IMITATES * (here - none)
-            if (close and j < CLOSEST) or there.log_evidence > here + math.log(CALIBRATED.undecided):
+    for k, (mine, b) in enumerate(zip(linear.found, beside, strict=False)):
+        for j, ((m, there), gain) in enumerate(zip(b.rivals, b.gains, strict=True)):
+            close = gain - b.loss > -IMITATES * b.loss
+            if (close and j < CLOSEST) or gain > math.log(CALIBRATED.undecided):
                 begun.append((k, m, tuple(m if x is mine else x for x in linear.found), there.values))
     if not begun:
         return []
@@ -326,34 +355,24 @@ def _swaps(linear: LinearStage, pool: ThreadPoolExecutor) -> list[_Swap]:
             for (k, m, members, _), f in zip(begun, fits, strict=True)]
 
 
-def _best_of_families(linear: LinearStage, others: Set) -> list[tuple[Member, Predicted]]:
-    """Of each family that is not in a set the member that is best beside it."""
-    taken = {m.hypothesis.family for m in linear.found}
-    best: dict[str, tuple[Member, Predicted]] = {}
-    for m in linear.options:
-        there, family = linear.predicted((*others, m)), m.hypothesis.family
-        if family not in taken and there.log_evidence > (best[family][1].log_evidence if family in best else -np.inf):
-            best[family] = m, there
-    return list(best.values())
+def _ranked(selection: Selection, beside: _Beside, swaps: Sequence[_Swap]) -> Selection:
+    """The selection of an effect, with the probabilities that it and its rivals have beside the others.
 
-
-def _ranked(linear: LinearStage, place: int, selection: Selection, swaps: Sequence[_Swap]) -> Selection:
-    """The selection of an effect, with the probabilities that it and its rivals have beside the others."""
-    if len(linear.found) == 1:
-        return selection
-    mine = linear.found[place]
-    others = tuple(m for m in linear.found if m is not mine)
-    here, none = linear.predicted(linear.found).log_evidence, linear.predicted(others).log_evidence
-    gains = {m.hypothesis.family: there.log_evidence - here for m, there in _best_of_families(linear, others)}
-    fitted = {s.member.hypothesis.family: s for s in swaps if s.place == place}
+    Args:
+        selection: of the effect.
+        beside: what the linear model says of it.
+        swaps: its rivals that were fitted.
+    """
+    fitted = {s.member.hypothesis.family: s for s in swaps}
+    gains = {m.hypothesis.family: gain for (m, _), gain in zip(beside.rivals, beside.gains, strict=True)}
     gains |= {family: s.gain for family, s in fitted.items()}
     weight = {family: float(np.exp(min(gain, 0.0))) for family, gain in gains.items()}
-    total = 1.0 + sum(weight.values()) + float(np.exp(min(none - here, 0.0)))
+    total = 1.0 + sum(weight.values()) + float(np.exp(min(beside.loss, 0.0)))
     first = replace(selection[0], probability=1.0 / total)
     rivals = [RankedHypothesis(s.member.hypothesis, s.fit, first.gain + s.gain, weight[family] / total)
               for family, s in fitted.items()]
     rivals += [replace(r, probability=weight.get(r.hypothesis.family, 0.0) / total) for r in selection[1:]
-               if r.hypothesis.family not in {*fitted, mine.hypothesis.family}]
+               if r.hypothesis.family not in {*fitted, first.hypothesis.family}]
     return (first, *sorted(rivals, key=lambda r: -r.probability))
 
 
