@@ -6,7 +6,8 @@ import pytest
 from aeropend_ident.diagnosis.search.proposed_formula import definition, propose
 from aeropend_ident.diagnosis.search.term_shapes import CONSTANTS, SHAPES
 from aeropend_sim.model import effect_file
-from aeropend_sim.model.formula import QUANTITIES, compiled
+from aeropend_sim.model.compiled_formula import compiled
+from aeropend_sim.model.formula import QUANTITIES
 
 UNITS = {"theta": "rad", "theta_dot": "rad/s", "omega": "rad/s", "thrust": "N"}
 N = 4000

@@ -333,7 +333,7 @@ def test_a_recorded_duty_drives_the_plant_and_leaves_it_at_rest(bags, processes)
     applied = recording.duty[np.isfinite(recording.duty)]
     steps = applied[np.flatnonzero(np.diff(applied, prepend=-1.0))]
     assert steps.tolist() == [0.0, 0.25, 0.5, 0.125, 0.375, 0.0]
-    assert recording.theta[-1] != recording.theta[0]
+    assert np.ptp(recording.theta) > 0.1  # rad; where the recording ends, the arm may hang as it did at the start
 
 
 def heard(bags, processes, values, *parameters, remap=(), number=None, step_ns=200_000_000, topic="/duty_command"):

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aeropend_sim.model.formula import FUNCTIONS, QUANTITIES, FormulaError, compiled, dimension, parse
+from aeropend_sim.model.compiled_formula import compiled
+from aeropend_sim.model.formula import FUNCTIONS, QUANTITIES, FormulaError, dimension, parse
 
 KNOWN = [*QUANTITIES, "k", "at"]
 UNITS = {**QUANTITIES, "k": "1/s", "at": "rad"}

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from aeropend_ident.bags.mending import mend
 from aeropend_ident.bags.reading import RecordingError
@@ -147,6 +146,8 @@ def one_clock(stamps: Stamps, received: Stamps, notes: list[str]) -> tuple[Stamp
     kept = np.ones(len(stamps), dtype=bool)
     if (np.diff(received) >= 0).all() and (np.diff(stamps) <= SET_FORWARD).all():
         return stamps, kept
+    from scipy.ndimage import median_filter  # its import is slow
+
     order = np.argsort(received, kind="stable")
     usual = median_filter(stamps[order], 2 * NEIGHBOURS + 1, mode="nearest")
     order = order[np.abs(stamps[order] - usual) <= SET_BACK]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.fft import dct
 
 from aeropend_ident.estimation.map_fit import band_log_likelihood, bands
+from aeropend_sim.compiled import njit
 
 Array = NDArray[np.float64]
 
@@ -68,26 +69,63 @@ class LinearSets:
             mean: (P,) means of the prior of the parameters.
             prior: (P, P) its information matrix.
         """
-        at, of = np.array(columns, np.intp), np.array([*fixed, -1], np.intp)
-        inner = self.products[:, at[:, None], at] * np.outer(unit, unit)
-        cross = self.products[:, at[:, None], of].sum(axis=2) * unit
-        rest = self.products[:, of[:, None], of].sum(axis=(1, 2))
-
-        def noise(step: Array) -> Array:
-            """Mean square of what a step leaves in each band."""
-            power = rest + 2.0 * cross @ step + np.einsum("bij,i,j->b", inner, step, step)
-            return np.maximum(power, 0.0) / self.count
-
-        step = np.zeros(len(at))
-        power = noise(step)
-        likelihood = band_log_likelihood(power, self.count)
-        for _ in range(STEPS):
-            weight = 1.0 / np.maximum(power, 1.0)
-            step = np.linalg.solve(np.tensordot(weight, inner, 1) + prior, prior @ mean - weight @ cross)
-            power, before = noise(step), likelihood
-            likelihood = band_log_likelihood(power, self.count)
-            if abs(likelihood - before) < SETTLED:
-                break
-        information, off = np.tensordot(self.weight, inner, 1) + prior, step - mean
+        at, of = np.array(columns, np.intp), np.array([*fixed, -1], np.intp) % self.products.shape[1]
+        step, inner, likelihood = _estimate(self.products, self.count, self.weight, at, unit, of, prior, prior @ mean)
+        information, off = inner + prior, step - mean
         occam = 0.5 * float(np.linalg.slogdet(prior)[1] - off @ prior @ off - np.linalg.slogdet(information)[1])
         return Solution(step, likelihood + occam)
+
+
+@njit(nogil=True)
+def _estimate(products: Array, count: Array, weight: Array, at: NDArray[np.intp], unit: Array, of: NDArray[np.intp],
+              prior: Array, pull: Array) -> tuple[Array, Array, float]:
+    """The MAP estimate of a subset, by steps that renew the noise of the bands.
+
+    Args:
+        products: (B, K, K) products of the columns in each band.
+        count: (B,) coefficients in each band.
+        weight: (B,) what a sample counts for in the Occam factor.
+        at: (P,) columns whose factors are estimated.
+        unit: (P,) factor of each column per unit of its parameter.
+        of: (R,) columns whose sum is explained.
+        prior: (P, P) information matrix of the prior.
+        pull: (P,) that matrix times the means.
+
+    Returns:
+        Factors (P,), weighted products (P, P) of the columns, and log likelihood.
+    """
+    bands_, size = len(count), len(at)
+    inner, cross, rest = np.zeros((bands_, size, size)), np.zeros((bands_, size)), np.zeros(bands_)
+    weighted = np.zeros((size, size))
+    for b in range(bands_):
+        for j in range(size):
+            for k in range(size):
+                inner[b, j, k] = products[b, at[j], at[k]] * unit[j] * unit[k]
+                weighted[j, k] += weight[b] * inner[b, j, k]
+            for column in of:
+                cross[b, j] += products[b, at[j], column] * unit[j]
+        for one in of:
+            for other in of:
+                rest[b] += products[b, one, other]
+    step, power = np.zeros(size), np.maximum(rest, 0.0) / count
+    likelihood = band_log_likelihood(power, count)
+    for _ in range(STEPS):
+        information, gradient = prior.copy(), pull.copy()
+        for b in range(bands_):
+            w = 1.0 / max(power[b], 1.0)
+            for j in range(size):
+                gradient[j] -= w * cross[b, j]
+                for k in range(size):
+                    information[j, k] += w * inner[b, j, k]
+        step = np.linalg.solve(information, gradient)
+        for b in range(bands_):
+            left = rest[b]
+            for j in range(size):
+                left += 2.0 * cross[b, j] * step[j]
+                for k in range(size):
+                    left += step[j] * inner[b, j, k] * step[k]
+            power[b] = max(left, 0.0) / count[b]
+        before, likelihood = likelihood, band_log_likelihood(power, count)
+        if abs(likelihood - before) < SETTLED:
+            break
+    return step, weighted, likelihood

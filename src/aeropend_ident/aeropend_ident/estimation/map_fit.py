@@ -36,6 +36,7 @@ from scipy.optimize import lsq_linear
 
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.statistics import effective_sample_size
+from aeropend_sim.compiled import njit
 
 Array = NDArray[np.float64]
 Residuals = Mapping[str, Array]
@@ -171,20 +172,24 @@ def whittle(r: Array) -> float:
     if not len(r):
         return 0.0
     edges = bands(len(r))
-    count = np.diff(edges)
+    count = np.diff(edges).astype(float)
     power = np.add.reduceat(dct(r, norm="ortho") ** 2, edges[:-1]) / count
     return band_log_likelihood(power, count)
 
 
-def band_log_likelihood(power: Array, count: Array | NDArray[np.intp]) -> float:
+@njit(nogil=True)
+def band_log_likelihood(power: Array, count: Array) -> float:
     """Log likelihood of a residual by its bands, the noise of each that of the residual, but at least a reading's.
 
     Args:
         power: (B,) mean square of the residual in each band, in units of a reading's noise.
         count: (B,) coefficients in each band.
     """
-    noise = np.maximum(power, 1.0)
-    return float(-0.5 * np.sum(count * (np.log(noise) + power / noise)))
+    total = 0.0
+    for k in range(len(power)):
+        noise = max(power[k], 1.0)
+        total -= 0.5 * count[k] * (math.log(noise) + power[k] / noise)
+    return total
 
 
 @cache

@@ -13,8 +13,9 @@ from aeropend_sim.export import plant_step
 from aeropend_sim.export.specialise import Known, Program, Type, Value, field_of
 from aeropend_sim.model import dynamics
 from aeropend_sim.model import terms as model_terms
+from aeropend_sim.model.compiled_formula import CALLS
 from aeropend_sim.model.effects import Effect
-from aeropend_sim.model.formula import CONSTANTS, FUNCTIONS, QUANTITIES, parse
+from aeropend_sim.model.formula import CONSTANTS, QUANTITIES, parse
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 from aeropend_sim.untrusted import one_line
 
@@ -63,7 +64,7 @@ class _Formulas:
         if effect.memory:
             values[MEMORY] = memory
         arguments: dict[str, Type] = dict.fromkeys(values, float)
-        known = {**CONSTANTS, **called.numbers, **{name: f.call for name, f in FUNCTIONS.items()}}
+        known = {**CONSTANTS, **called.numbers, **CALLS}
         text, name, doc = effect.term, f"term_{effect.id}", effect.physics
         if called.rate:
             text, name, doc = effect.rate, f"rate_{effect.id}", f"d{effect.memory}/dt of {effect.id}"

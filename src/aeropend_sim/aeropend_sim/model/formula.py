@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Formulas of effects: text in, a checked expression out, compiled to machine code.
+"""Formulas of effects: text in, a checked expression out.
 
-A formula is arithmetic over named quantities, with a few functions. Its text is never executed: it is parsed, each part
-of it is checked against what is allowed here, and the compiled function is built from the checked parts.
+A formula is arithmetic over named quantities, with a few functions. Its text is never executed: it is parsed, and each
+part of it is checked against what is allowed here. `compiled_formula` makes machine code of the checked parts.
 """
 
 from __future__ import annotations
@@ -11,15 +11,10 @@ import ast
 import difflib
 import math
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cache
-from typing import Any
 
-from numba import types
-
-from aeropend_sim.compiled import c_function, njit
 from aeropend_sim.errors import UserError
 
 LONGEST = 2000
@@ -42,34 +37,6 @@ class FormulaError(UserError):
 
 # --- functions
 
-
-@njit(cached=False, error_model="numpy")
-def _step(x: float) -> float:
-    return 1.0 if x >= 0.0 else 0.0
-
-
-@njit(cached=False, error_model="numpy")
-def _sign(x: float) -> float:
-    return 1.0 if x > 0.0 else (-1.0 if x < 0.0 else 0.0)
-
-
-@njit(cached=False, error_model="numpy")
-def _clip(x: float, low: float, high: float) -> float:
-    return min(max(x, low), high)
-
-
-@njit(cached=False, error_model="numpy")
-def _table(x: float, *points: float) -> float:
-    """Straight lines through points x1, y1, x2, y2, …; beyond the first and the last point the value stays."""
-    if not x > points[0]:
-        return points[1]
-    for k in range(2, len(points), 2):
-        if x <= points[k]:
-            share = (x - points[k - 2]) / (points[k] - points[k - 2])
-            return points[k - 1] + share * (points[k + 1] - points[k - 1])
-    return points[len(points) - 1]
-
-
 PURE, KEEPS, FREE = "pure number", "keeps", "free"
 
 
@@ -78,23 +45,20 @@ class _Function:
     """A function that a formula may call.
 
     Attributes:
-        call: what is called.
         arguments: their number; None: x and at least two points.
         unit: `PURE`: takes and gives pure numbers; `KEEPS`: all arguments have one unit, which it gives; `FREE`: takes
             any unit, and gives a pure number.
     """
 
-    call: Callable[..., float]
     arguments: int | None
     unit: str
 
 
 FUNCTIONS = {
-    **{name: _Function(getattr(math, name), 1, PURE)
-       for name in ("sin", "cos", "tan", "atan", "sinh", "cosh", "tanh", "exp", "log")},
-    "sqrt": _Function(math.sqrt, 1, KEEPS), "abs": _Function(abs, 1, KEEPS), "min": _Function(min, 2, KEEPS),
-    "max": _Function(max, 2, KEEPS), "clip": _Function(_clip, 3, KEEPS), "sign": _Function(_sign, 1, FREE),
-    "step": _Function(_step, 1, FREE), "table": _Function(_table, None, KEEPS),
+    **{name: _Function(1, PURE) for name in ("sin", "cos", "tan", "atan", "sinh", "cosh", "tanh", "exp", "log")},
+    "sqrt": _Function(1, KEEPS), "abs": _Function(1, KEEPS), "min": _Function(2, KEEPS), "max": _Function(2, KEEPS),
+    "clip": _Function(3, KEEPS), "sign": _Function(1, FREE), "step": _Function(1, FREE),
+    "table": _Function(None, KEEPS),
 }
 """The functions of a formula. step(x) is 1 from 0 on, else 0; table(x, x1, y1, x2, y2, …) joins points by lines."""
 
@@ -377,49 +341,3 @@ def _finite(value: float) -> bool:
 def _short(text: str) -> str:
     text = " ".join(text.split())
     return text if len(text) <= 60 else f"{text[:60]}…"
-
-
-# --- compiling
-
-SIGNATURE = types.float64(*[types.float64] * (len(QUANTITIES) + 1), types.CPointer(types.float64))
-"""A compiled formula takes the quantities in the order of `QUANTITIES`, the memory, and a pointer to parameters."""
-
-
-class _Coded(ast.NodeTransformer):
-    """The checked expression as code: parameters become elements of an array, integers become floats."""
-
-    def __init__(self, parameters: Sequence[str], memory: str) -> None:
-        self.parameters, self.memory = parameters, memory
-
-    def visit_Constant(self, node: ast.Constant) -> ast.expr:
-        return ast.Constant(float(node.value))  # type: ignore[arg-type]
-
-    def visit_Name(self, node: ast.Name) -> ast.expr:
-        if node.id in self.parameters:
-            return ast.parse(f"p_[{self.parameters.index(node.id)}]", mode="eval").body
-        if node.id in CONSTANTS:
-            return ast.Constant(CONSTANTS[node.id])
-        return ast.Name("m_" if node.id == self.memory else node.id, ast.Load())
-
-    def visit_Call(self, node: ast.Call) -> ast.expr:
-        return ast.Call(ast.Name(f"f_{node.func.id}", ast.Load()),  # type: ignore[attr-defined]
-                        [self.visit(each) for each in node.args], [])
-
-
-@cache
-def compiled(text: str, parameters: tuple[str, ...], memory: str = "") -> Any:
-    """A formula as a C function with `SIGNATURE`; its attribute `address` is where it lies.
-
-    Args:
-        text: a formula that `parse` has checked.
-        parameters: their names, in the order of the array that the function takes.
-        memory: name of the memory; "" for none.
-    """
-    known = [*QUANTITIES, *parameters, *([memory] * bool(memory))]
-    body = _Coded(parameters, memory).visit(parse(text, known).expression)
-    arguments = [*QUANTITIES, "m_", "p_"]
-    function = ast.parse(f"def formula({', '.join(arguments)}):\n    return 0.0 + _\n")
-    function.body[0].body[0].value.right = body  # type: ignore[attr-defined]
-    names: dict[str, Any] = {f"f_{name}": f.call for name, f in FUNCTIONS.items()}
-    exec(compile(ast.fix_missing_locations(function), "<formula>", "exec"), names)  # noqa: S102 - of checked parts
-    return c_function(SIGNATURE, names["formula"])

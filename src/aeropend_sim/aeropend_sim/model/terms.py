@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from aeropend_sim.compiled import njit
 from aeropend_sim.errors import UserError
+from aeropend_sim.model.compiled_formula import compiled
 from aeropend_sim.model.effects import DEFINED, Effect, is_active
-from aeropend_sim.model.formula import QUANTITIES, compiled
+from aeropend_sim.model.formula import QUANTITIES
 
 Array = NDArray[np.float64]
 

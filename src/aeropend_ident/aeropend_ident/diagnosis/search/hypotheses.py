@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import qmc
 
 from aeropend_ident.diagnosis.chain.chain import DELAY, CutChains
 from aeropend_ident.diagnosis.chain.known import Known
@@ -235,6 +234,8 @@ def _size(id_: str, model: Model, share: float) -> Parameter:
 def _scattered(id_: str, head: Parameter, others: Sequence[tuple[str, EffectParameter]]
                ) -> list[tuple[Parameter, ...]]:
     """Start points of an effect by formula: at its defaults, and evenly over the ranges of its other parameters."""
+    from scipy.stats import qmc  # its import is slow
+
     points = np.vstack([np.full(len(others), math.nan), qmc.Sobol(len(others), seed=0).random(SCATTERED)])
     return [(head, *(_somewhere(f"{id_}.{name}", p, share) for (name, p), share in zip(others, point, strict=True)))
             for point in points.tolist()]
