@@ -58,16 +58,6 @@ def njit(cached: bool = True, **options: Any) -> Callable[[F], F]:
     return decorate
 
 
-def c_function(signature: Any, function: Callable[..., Any]) -> Any:
-    """A function of C, compiled when it is made and not kept on disk; its attribute `address` is where it lies.
-
-    Args:
-        signature: of numba.
-        function: in Python.
-    """
-    return numba.cfunc(signature, error_model="numpy")(function)
-
-
 @cache
 def source_hash(module: str) -> str:
     """Hash of a module's source and of the sources of all modules of these packages that it imports at its top.

@@ -42,6 +42,19 @@ def test_a_formula_has_its_value(text, known, expected):
     assert value(text, **known) == pytest.approx(expected, rel=1e-12)
 
 
+@given(st.sampled_from(sorted(FUNCTIONS)), st.lists(st.integers(-6, 6), min_size=7, max_size=7))
+def test_a_compiled_function_gives_what_the_function_gives(name, whole):
+    x = [0.5 * each for each in whole]
+    if name in {"log", "sqrt"}:
+        x[0] = abs(x[0]) + 0.5
+    if name == "table":
+        x[1::2] = sorted(x[1::2])
+    own = x[:FUNCTIONS[name].arguments or 7]
+    names = [*QUANTITIES][:len(own)]
+    got = value(f"{name}({', '.join(names)})", **dict(zip(names, own, strict=True)))
+    assert got == pytest.approx(FUNCTIONS[name].call(*own), rel=1e-15, abs=1e-300)
+
+
 @pytest.mark.parametrize("text", ["1/(k - k)", "log(-1)", "sqrt(-1)", "9.0**9**9**9", "exp(exp(99))", "0/(k - k)"])
 def test_what_has_no_value_raises_nothing(text):
     assert not math.isfinite(value(text))

@@ -396,7 +396,7 @@ def _closes_more(learned: Gap, known: _Gaps, parts: Sequence[Part], material: fl
 def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Findings:
     """Search effects, detect those that only statistics show, and judge whether one is unknown."""
     chains, recordings = fitted, fitted.recordings
-    stages = unsearched(fitted) if fitted.policy.driven else {}
+    nominal = stages = unsearched(fitted) if fitted.policy.driven else {}
     trifle = trifling_gap(fitted, stages)
     if fitted.policy.wide_search:
         left = stages["arm"].base.residuals
@@ -410,12 +410,12 @@ def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Finding
         chains.further, chains.left_out = fitted.further, fitted.left_out
     deadline = settings.deadline
 
-    def searched(chains: CutChains) -> dict[str, Findings]:
+    def searched(chains: CutChains, nominal: Mapping[str, Findings] | None = None) -> dict[str, Findings]:
         return search(chains, settings.jobs,
                       lambda stage, share: progress(f"searching effects of the {stage}", 0.7 * share), deadline,
-                      trifle)
+                      trifle, nominal)
 
-    stages, begun = searched(chains), None
+    stages, begun = searched(chains, nominal), None
     if not passed(deadline):
         chains, stages, begun = onset.search_within_windows(chains, stages, searched)
     recordings = [replace(s, window=c.window).noted(*fitted.notes)

@@ -13,9 +13,8 @@ from aeropend_sim.export import plant_step
 from aeropend_sim.export.specialise import Known, Program, Type, Value, field_of
 from aeropend_sim.model import dynamics
 from aeropend_sim.model import terms as model_terms
-from aeropend_sim.model.compiled_formula import CALLS
 from aeropend_sim.model.effects import Effect
-from aeropend_sim.model.formula import CONSTANTS, QUANTITIES, parse
+from aeropend_sim.model.formula import CONSTANTS, FUNCTIONS, QUANTITIES, parse
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 from aeropend_sim.untrusted import one_line
 
@@ -64,7 +63,7 @@ class _Formulas:
         if effect.memory:
             values[MEMORY] = memory
         arguments: dict[str, Type] = dict.fromkeys(values, float)
-        known = {**CONSTANTS, **called.numbers, **CALLS}
+        known = {**CONSTANTS, **called.numbers, **{name: f.call for name, f in FUNCTIONS.items()}}
         text, name, doc = effect.term, f"term_{effect.id}", effect.physics
         if called.rate:
             text, name, doc = effect.rate, f"rate_{effect.id}", f"d{effect.memory}/dt of {effect.id}"
@@ -82,7 +81,7 @@ class _Called:
 
 
 class _Coded(ast.NodeTransformer):
-    """Whole numbers of a formula are floats, as in `formula.compiled`; the memory gets a name that nothing else has."""
+    """Whole numbers of a formula are floats, as in `compiled_formula`; the memory gets a name that nothing else has."""
 
     def __init__(self, memory: str) -> None:
         self.memory = memory

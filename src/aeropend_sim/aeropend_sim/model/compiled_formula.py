@@ -1,92 +1,154 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Formulas of effects as machine code, built from the parts that `formula` has checked."""
+"""Formulas of effects as machine code, which LLVM makes of the parts that `formula` has checked.
+
+numba takes 50 to 100 ms to compile a formula, LLVM alone 3; a search tries dozens of formulas.
+"""
 
 from __future__ import annotations
 
 import ast
-import math
-from collections.abc import Callable, Sequence
+import ctypes
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
+from itertools import count, pairwise
 from typing import Any
 
-from numba import types
+from llvmlite import ir
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.registry import cpu_target
 
-from aeropend_sim.compiled import c_function, njit
-from aeropend_sim.model.formula import CONSTANTS, FUNCTIONS, QUANTITIES, parse
+from aeropend_sim.model.formula import CONSTANTS, QUANTITIES, parse
 
-
-@njit(cached=False, error_model="numpy")
-def _step(x: float) -> float:
-    return 1.0 if x >= 0.0 else 0.0
-
-
-@njit(cached=False, error_model="numpy")
-def _sign(x: float) -> float:
-    return 1.0 if x > 0.0 else (-1.0 if x < 0.0 else 0.0)
-
-
-@njit(cached=False, error_model="numpy")
-def _clip(x: float, low: float, high: float) -> float:
-    return min(max(x, low), high)
-
-
-@njit(cached=False, error_model="numpy")
-def _table(x: float, *points: float) -> float:
-    """Straight lines through points x1, y1, x2, y2, …; beyond the first and the last point the value stays."""
-    if not x > points[0]:
-        return points[1]
-    for k in range(2, len(points), 2):
-        if x <= points[k]:
-            share = (x - points[k - 2]) / (points[k] - points[k - 2])
-            return points[k - 1] + share * (points[k + 1] - points[k - 1])
-    return points[len(points) - 1]
-
-
-CALLS: dict[str, Callable[..., float]] = {
-    **{name: getattr(math, name) for name in FUNCTIONS if hasattr(math, name)},
-    "abs": abs, "min": min, "max": max, "clip": _clip, "sign": _sign, "step": _step, "table": _table,
-}
-"""What is called for each function of a formula."""
-
-SIGNATURE = types.float64(*[types.float64] * (len(QUANTITIES) + 1), types.CPointer(types.float64))
+NUMBER = ir.DoubleType()
+SIGNATURE = ir.FunctionType(NUMBER, [NUMBER] * (len(QUANTITIES) + 1) + [NUMBER.as_pointer()])
 """A compiled formula takes the quantities in the order of `QUANTITIES`, the memory, and a pointer to parameters."""
 
+_numbered = count()
 
-class _Coded(ast.NodeTransformer):
-    """The checked expression as code: parameters become elements of an array, integers become floats."""
 
-    def __init__(self, parameters: Sequence[str], memory: str) -> None:
-        self.parameters, self.memory = parameters, memory
+@dataclass(frozen=True)
+class Code:
+    """A compiled formula.
 
-    def visit_Constant(self, node: ast.Constant) -> ast.expr:
-        return ast.Constant(float(node.value))  # type: ignore[arg-type]
+    Attributes:
+        address: where the function lies.
+        library: what keeps it there.
+    """
 
-    def visit_Name(self, node: ast.Name) -> ast.expr:
-        if node.id in self.parameters:
-            return ast.parse(f"p_[{self.parameters.index(node.id)}]", mode="eval").body
-        if node.id in CONSTANTS:
-            return ast.Constant(CONSTANTS[node.id])
-        return ast.Name("m_" if node.id == self.memory else node.id, ast.Load())
+    address: int
+    library: Any
 
-    def visit_Call(self, node: ast.Call) -> ast.expr:
-        return ast.Call(ast.Name(f"f_{node.func.id}", ast.Load()),  # type: ignore[attr-defined]
-                        [self.visit(each) for each in node.args], [])
+    @property
+    def ctypes(self) -> Callable[..., float]:
+        """The function, to be called from Python."""
+        numbers = [ctypes.c_double] * (len(QUANTITIES) + 1)
+        return ctypes.CFUNCTYPE(ctypes.c_double, *numbers, ctypes.POINTER(ctypes.c_double))(self.address)
 
 
 @cache
-def compiled(text: str, parameters: tuple[str, ...], memory: str = "") -> Any:
-    """A formula as a C function with `SIGNATURE`; its attribute `address` is where it lies.
+def compiled(text: str, parameters: tuple[str, ...], memory: str = "") -> Code:
+    """A formula as a function of C with `SIGNATURE`.
 
     Args:
         text: a formula that `parse` has checked.
         parameters: their names, in the order of the array that the function takes.
         memory: name of the memory; "" for none.
     """
-    known = [*QUANTITIES, *parameters, *([memory] * bool(memory))]
-    body = _Coded(parameters, memory).visit(parse(text, known).expression)
-    arguments = [*QUANTITIES, "m_", "p_"]
-    function = ast.parse(f"def formula({', '.join(arguments)}):\n    return 0.0 + _\n")
-    function.body[0].body[0].value.right = body  # type: ignore[attr-defined]
-    names: dict[str, Any] = {f"f_{name}": call for name, call in CALLS.items()}
-    exec(compile(ast.fix_missing_locations(function), "<formula>", "exec"), names)  # noqa: S102 - of checked parts
-    return c_function(SIGNATURE, names["formula"])
+    expression = parse(text, [*QUANTITIES, *parameters, *([memory] * bool(memory))]).expression
+    name = f"aeropend_formula_{next(_numbered)}"
+    library = cpu_target.target_context.codegen().create_library(name)
+    module = library.create_ir_module(name)
+    function = ir.Function(module, SIGNATURE, name)
+    builder = ir.IRBuilder(function.append_basic_block())
+    *given, numbers = function.args
+    known = dict(zip([*QUANTITIES, memory], given, strict=True))
+    for k, own in enumerate(parameters):
+        known[own] = builder.load(builder.gep(numbers, [ir.IntType(64)(k)]))
+    builder.ret(_Writer(builder, known).value(expression))
+    with global_compiler_lock:
+        library.add_ir_module(module)
+        library.finalize()
+    return Code(library.get_pointer_to_function(name), library)
+
+
+class _Writer:
+    """Writes the instructions of an expression.
+
+    Args:
+        builder: where they go.
+        known: values of the names.
+    """
+
+    def __init__(self, builder: ir.IRBuilder, known: Mapping[str, ir.Value]) -> None:
+        self.to = builder
+        self.known = {**{name: NUMBER(x) for name, x in CONSTANTS.items()}, **known}
+
+    def value(self, node: ast.expr) -> ir.Value:
+        """The value of a part of the expression."""
+        if isinstance(node, ast.Constant):
+            return NUMBER(float(node.value))  # type: ignore[arg-type]
+        if isinstance(node, ast.Name):
+            return self.known[node.id]
+        if isinstance(node, ast.UnaryOp):
+            inner = self.value(node.operand)
+            return self.to.fneg(inner) if isinstance(node.op, ast.USub) else inner
+        if isinstance(node, ast.BinOp):
+            left, right = self.value(node.left), self.value(node.right)
+            if isinstance(node.op, ast.Pow):
+                return self.outside("llvm.pow.f64", left, right)
+            write = {ast.Add: self.to.fadd, ast.Sub: self.to.fsub, ast.Mult: self.to.fmul, ast.Div: self.to.fdiv}
+            return write[type(node.op)](left, right)
+        assert isinstance(node, ast.Call)
+        assert isinstance(node.func, ast.Name)
+        return self.called(node.func.id, [self.value(x) for x in node.args])
+
+    def called(self, name: str, x: Sequence[ir.Value]) -> ir.Value:
+        """The value of a function of a formula."""
+        zero, one = NUMBER(0.0), NUMBER(1.0)
+        if name == "min":
+            return self.to.select(self.to.fcmp_ordered("<", x[1], x[0]), x[1], x[0])
+        if name == "max":
+            return self.to.select(self.to.fcmp_ordered(">", x[1], x[0]), x[1], x[0])
+        if name == "clip":
+            return self.called("min", [self.called("max", x[:2]), x[2]])
+        if name == "step":
+            return self.to.select(self.to.fcmp_ordered(">=", x[0], zero), one, zero)
+        if name == "sign":
+            below = self.to.select(self.to.fcmp_ordered("<", x[0], zero), NUMBER(-1.0), zero)
+            return self.to.select(self.to.fcmp_ordered(">", x[0], zero), one, below)
+        if name == "table":
+            return self.table(x[0], list(zip(x[1::2], x[2::2], strict=True)))
+        if name == "abs":
+            return self.outside("llvm.fabs.f64", *x)
+        known = {"sin", "cos", "exp", "log", "sqrt"}
+        return self.outside(f"llvm.{name}.f64" if name in known else name, *x)
+
+    def outside(self, name: str, *x: ir.Value) -> ir.Value:
+        """The value of a function of LLVM or of the C library."""
+        module = self.to.module
+        called = module.globals.get(name) or ir.Function(module, ir.FunctionType(NUMBER, [NUMBER] * len(x)), name)
+        return self.to.call(called, x)
+
+    def table(self, x: ir.Value, points: Sequence[tuple[ir.Value, ir.Value]]) -> ir.Value:
+        """Straight lines through points; beyond the first and the last point the value stays."""
+        done = self.to.append_basic_block()
+        ends = [(points[0][1], self.to.block)]
+        following = self.to.append_basic_block()
+        self.to.cbranch(self.to.fcmp_ordered(">", x, points[0][0]), following, done)
+        for (x0, y0), (x1, y1) in pairwise(points):
+            self.to.position_at_end(following)
+            here, following = self.to.append_basic_block(), self.to.append_basic_block()
+            self.to.cbranch(self.to.fcmp_ordered("<=", x, x1), here, following)
+            self.to.position_at_end(here)
+            share = self.to.fdiv(self.to.fsub(x, x0), self.to.fsub(x1, x0))
+            ends.append((self.to.fadd(y0, self.to.fmul(share, self.to.fsub(y1, y0))), here))
+            self.to.branch(done)
+        self.to.position_at_end(following)
+        self.to.branch(done)
+        ends.append((points[-1][1], following))
+        self.to.position_at_end(done)
+        found = self.to.phi(NUMBER)
+        for value, block in ends:
+            found.add_incoming(value, block)
+        return found

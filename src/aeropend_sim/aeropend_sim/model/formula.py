@@ -11,7 +11,7 @@ import ast
 import difflib
 import math
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -37,6 +37,30 @@ class FormulaError(UserError):
 
 # --- functions
 
+
+def _step(x: float) -> float:
+    return 1.0 if x >= 0.0 else 0.0
+
+
+def _sign(x: float) -> float:
+    return 1.0 if x > 0.0 else (-1.0 if x < 0.0 else 0.0)
+
+
+def _clip(x: float, low: float, high: float) -> float:
+    return min(max(x, low), high)
+
+
+def _table(x: float, *points: float) -> float:
+    """Straight lines through points x1, y1, x2, y2, …; beyond the first and the last point the value stays."""
+    if not x > points[0]:
+        return points[1]
+    for k in range(2, len(points), 2):
+        if x <= points[k]:
+            share = (x - points[k - 2]) / (points[k] - points[k - 2])
+            return points[k - 1] + share * (points[k + 1] - points[k - 1])
+    return points[len(points) - 1]
+
+
 PURE, KEEPS, FREE = "pure number", "keeps", "free"
 
 
@@ -45,20 +69,23 @@ class _Function:
     """A function that a formula may call.
 
     Attributes:
+        call: what it does; `compiled_formula` does the same.
         arguments: their number; None: x and at least two points.
         unit: `PURE`: takes and gives pure numbers; `KEEPS`: all arguments have one unit, which it gives; `FREE`: takes
             any unit, and gives a pure number.
     """
 
+    call: Callable[..., float]
     arguments: int | None
     unit: str
 
 
 FUNCTIONS = {
-    **{name: _Function(1, PURE) for name in ("sin", "cos", "tan", "atan", "sinh", "cosh", "tanh", "exp", "log")},
-    "sqrt": _Function(1, KEEPS), "abs": _Function(1, KEEPS), "min": _Function(2, KEEPS), "max": _Function(2, KEEPS),
-    "clip": _Function(3, KEEPS), "sign": _Function(1, FREE), "step": _Function(1, FREE),
-    "table": _Function(None, KEEPS),
+    **{name: _Function(getattr(math, name), 1, PURE)
+       for name in ("sin", "cos", "tan", "atan", "sinh", "cosh", "tanh", "exp", "log")},
+    "sqrt": _Function(math.sqrt, 1, KEEPS), "abs": _Function(abs, 1, KEEPS), "min": _Function(min, 2, KEEPS),
+    "max": _Function(max, 2, KEEPS), "clip": _Function(_clip, 3, KEEPS), "sign": _Function(_sign, 1, FREE),
+    "step": _Function(_step, 1, FREE), "table": _Function(_table, None, KEEPS),
 }
 """The functions of a formula. step(x) is 1 from 0 on, else 0; table(x, x1, y1, x2, y2, …) joins points by lines."""
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The terms of effects by formula inside the compiled equations: one compiled simulation serves every formula.
 
-A formula is compiled alone, in some hundredths of a second, and called by its address. So a new formula does not
+A formula is compiled alone, in some milliseconds, and called by its address. So a new formula does not
 compile the equations again.
 """
 

@@ -132,6 +132,7 @@ class Judge:
         self.chains, self.material = chains, material
         self.linear = LinearStages(chains)
         self.free = FreeRuns(chains, self.linear.parameters)
+        self._changed = stages_of(self.chains, [h for h in hypotheses if not h.parameter])
         self.acts_on = {h.name: self._stages(h) for h in hypotheses}
         self.hypotheses = list(hypotheses)
         self._noise: dict[tuple[str, ...], list[dict[str, float]]] = {}
@@ -146,7 +147,7 @@ class Judge:
         if h.parameter:
             shown = {self.linear.stage_of[c] for c in self.linear.column_of(h.parameter).rows}
             return tuple(b for b in self.linear.stages if b in shown)
-        return tuple(b for b in stages_of(self.chains, h) if b in self.linear.stages)
+        return tuple(b for b in self._changed[h.name] if b in self.linear.stages)
 
     @cached_property
     def rivals(self) -> dict[str, tuple[list[Rival], Screening]]:

@@ -251,23 +251,27 @@ def _somewhere(name: str, p: EffectParameter, share: float) -> Parameter:
     return Parameter(name, 0.5 * (p.low + p.high), 0.5 * (p.high - p.low), p.low, p.high, start)
 
 
-def stages_of(chains: CutChains, hypothesis: Hypothesis) -> tuple[str, ...]:
-    """The stages whose residuals a hypothesis changes, found by trying it."""
-    values: dict[str, float]
-    if hypothesis.parameter:
-        values = {hypothesis.parameter: 1.2 * chains.model.model[hypothesis.parameter]}
-    else:
-        values = {f"{hypothesis.effect}.{k}": p.default for k, p in DEFINED[hypothesis.effect].parameters.items()}
+def stages_of(chains: CutChains, tried: Sequence[Hypothesis]) -> dict[str, tuple[str, ...]]:
+    """Name of each hypothesis -> the stages whose residuals it changes, found by trying it."""
     guess = not chains.policy.calibrated
-    changed = []
-    for stage in STAGES:
-        # an effect of the arm shows only if the arm moves: without a drive it needs its initial state
-        state = {p.name: p.mean for p in initial_states(chains, stage)} if guess else {}
-        before, after = chains.residuals(stage)(state), chains.residuals(stage)({**state, **values})
-        if any(len(r) and not np.array_equal(r, after[k]) and not (
-                guess and np.allclose(r, after[k], rtol=0.0, atol=SAME)) for k, r in before.items()):
-            changed.append(stage)
-    return tuple(changed)
+    # an effect of the arm shows only if the arm moves: without a drive it needs its initial state
+    states = {stage: {p.name: p.mean for p in initial_states(chains, stage)} if guess else {} for stage in STAGES}
+    residuals = {stage: chains.residuals(stage) for stage in STAGES}
+    before = {stage: residuals[stage](states[stage]) for stage in STAGES}
+
+    def changes(stage: str, values: Mapping[str, float]) -> bool:
+        after = residuals[stage]({**states[stage], **values})
+        return any(len(r) and not np.array_equal(r, after[k]) and not (
+            guess and np.allclose(r, after[k], rtol=0.0, atol=SAME)) for k, r in before[stage].items())
+
+    out = {}
+    for h in tried:
+        if h.parameter:
+            values = {h.parameter: 1.2 * chains.model.model[h.parameter]}
+        else:
+            values = {f"{h.effect}.{k}": p.default for k, p in DEFINED[h.effect].parameters.items()}
+        out[h.name] = tuple(stage for stage in STAGES if changes(stage, values))
+    return out
 
 
 def delay_from_voltage(chains: CutChains, hypothesis: Hypothesis, values: Mapping[str, float]) -> Hypothesis:

@@ -161,7 +161,8 @@ def suspected(chains: CutChains, findings: Mapping[str, Findings]) -> list[Windo
         f = findings[stage]
         if not f.base.residuals or passes_as_noise(f.final, MATERIAL):
             continue
-        mine = [h for h in every if stages_of(chains, h)[:1] == (stage,)]
+        changed = stages_of(chains, every)
+        mine = [h for h in every if changed[h.name][:1] == (stage,)]
         return _best_windows(chains, stage, f, mine)
     return []
 

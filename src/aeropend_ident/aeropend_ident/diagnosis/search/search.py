@@ -89,7 +89,8 @@ Derived: it closes more than it leaves."""
 
 
 def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], None] = lambda *_: None,
-           deadline: float | None = None, trifle: float = 0.0) -> dict[str, Findings]:
+           deadline: float | None = None, trifle: float = 0.0, nominal: Mapping[str, Findings] | None = None
+           ) -> dict[str, Findings]:
     """Search for effects stage by stage, along the chain.
 
     Args:
@@ -99,6 +100,7 @@ def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], No
         deadline: [s] of `time.monotonic` after which no further effect is searched; None: the budget of the policy.
         trifle: squared gap below which the rest of a stage is not searched, nor an effect accepted; see
             `trifling_gap`.
+        nominal: what `unsearched` returns for these chains, which saves its fits; None: they are made.
 
     Returns:
         Stage -> what was found.
@@ -107,14 +109,18 @@ def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], No
     calibrated, known = chains.policy.calibrated, chains.known
     all_ = hypotheses(chains.model, chains.further, chains.left_out, mismatches=calibrated, known=known)
     everything = [as_identified(chains, h) for h in all_ if not is_decided(chains, h)]
-    acts_on = {h.family: stages_of(chains, h) for h in everything}
+    stages = stages_of(chains, everything)
+    acts_on = {h.family: stages[h.name] for h in everything}
     carried: dict[str, Parameter] = {}
+    bases = {stage: f.final for stage, f in (nominal or {}).items()}
     with ThreadPoolExecutor(jobs) as pool:
         for done, stage in enumerate(STAGES):
             progress(stage, done / len(STAGES))
             mine = [h for h in everything if acts_on[h.family][:1] == (stage,)]
-            f = _search_stage(chains, stage, mine, acts_on, list(carried.values()), trifle, pool, deadline)
+            f = _search_stage(chains, stage, mine, acts_on, list(carried.values()), bases, trifle, pool, deadline)
             findings[stage] = f
+            if f.final is not bases.get(stage):  # the input of the next stage changes
+                bases = {b: base for b, base in bases.items() if b not in list(STAGES)[done + 1:done + 2]}
             # an effect that acts on later stages too goes along, with the uncertainty that it has here
             for h in f.effects:
                 if len(acts_on[h.family]) > 1:
@@ -129,7 +135,7 @@ def unsearched(chains: CutChains) -> dict[str, Findings]:
     """The fits of the nominal structure alone, stage by stage, with nothing found."""
     findings = {}
     for stage in STAGES:
-        base = fit(chains.residuals(stage), nominal_parameters(chains, stage))
+        base = fit(chains.residuals(stage), nominal_parameters(chains, stage), least_ess=chains.policy.least_ess)
         findings[stage] = Findings(stage, base, base)
         chains.set_next_input(stage, base.values)
     return findings
@@ -146,18 +152,19 @@ def trifling_gap(chains: CutChains, nominal: Mapping[str, Findings]) -> float:
 
 
 def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
-                  acts_on: Mapping[str, tuple[str, ...]], carried: list[Parameter], trifle: float,
-                  pool: ThreadPoolExecutor, deadline: float | None) -> Findings:
+                  acts_on: Mapping[str, tuple[str, ...]], carried: list[Parameter], bases: Mapping[str, Fit],
+                  trifle: float, pool: ThreadPoolExecutor, deadline: float | None) -> Findings:
+    def fitted(b: str, parameters: Sequence[Parameter]) -> Fit:
+        return fit(chains.residuals(b), parameters, least_ess=chains.policy.least_ess, deadline=deadline)
+
     nominal: list[Parameter] = [*nominal_parameters(chains, stage), *carried]
-    base = fit(chains.residuals(stage), nominal, least_ess=chains.policy.least_ess, deadline=deadline)
+    base = bases[stage] if stage in bases and not carried else fitted(stage, nominal)
     findings = Findings(stage, base, base)
     if not base.residuals:
         return findings
     candidates = [delay_from_voltage(chains, h, base.values) for h in candidates]
     others = {b for h in candidates for b in acts_on[h.family] if b != stage}
-    downstream = {b: fit(chains.residuals(b), nominal_parameters(chains, b), least_ess=chains.policy.least_ess,
-                         deadline=deadline)
-                  for b in others}
+    downstream = {b: bases[b] if b in bases else fitted(b, nominal_parameters(chains, b)) for b in others}
     known, supported, gained = nominal, findings, 0.0
     in_sets = chains.policy.calibrated and chains.known is None
     while len(findings.found) < (1 if in_sets else MOST_EFFECTS):
