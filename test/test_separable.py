@@ -65,7 +65,7 @@ def names(body: dict) -> list[tuple[str, float, bool]]:
 def test_both_are_named_and_the_experiment_advised_tells_them_apart(case):
     model = case.rig()
     poor = recorded(model, case.poor.series(), case.seed - 700, settled=20.0)
-    body = diagnose(BENCH, [poor], 2).body
+    body = diagnose(BENCH, [poor]).body
     first = names(body)[0]
     assert first[2]
     assert first[1] < SURE
@@ -79,7 +79,7 @@ def test_both_are_named_and_the_experiment_advised_tells_them_apart(case):
 
     better = recorded(model, Excitation(**advice["excite"]).series(), case.seed)
     for recordings in ([better], [poor, better]):
-        body = diagnose(BENCH, recordings, 2).body
+        body = diagnose(BENCH, recordings).body
         name, probability, claimed = names(body)[0]
         assert (name, claimed) == (case.truth, True)
         assert probability > SURE

@@ -19,7 +19,7 @@ def test_a_lag_of_the_thrust_that_ends_is_no_lag_of_the_encoder():
     numbers = {n: v * (1.0 + rng.uniform(-0.05, 0.05)) for n, v in BENCH.model.items()}
     duty = cases.duty_signal(rng, 70.0)
     entry, columns = changes.onset("thrust_lag", numbers, BENCH.model, BENCH.sensing, duty, rng)
-    made = diagnose(BENCH, [from_arrays({**columns, "duty": duty}, plant.PERIOD, BENCH.sensing)], 2)
+    made = diagnose(BENCH, [from_arrays({**columns, "duty": duty}, plant.PERIOD, BENCH.sensing)])
     assert made.conclusions.which.verdict == "thrust_lag"
     (until,) = (c.until for c in made.conclusions.which.candidates if c.found)
     assert until is not None

@@ -18,7 +18,7 @@ BENCH = load("bench")
                                                        ("encoder_lag", "sensing", 1)])
 def test_a_lag_is_placed_by_what_curves_at_its_place_explain(effect, place, seed):
     case, columns = cases.draw("lag", "single", [effect], "other", BENCH.model, BENCH.sensing, seed, 40.0)
-    body = diagnose(BENCH, [from_arrays(columns, SAMPLE_PERIOD, BENCH.sensing)], 2).body
+    body = diagnose(BENCH, [from_arrays(columns, SAMPLE_PERIOD, BENCH.sensing)]).body
     assert case.form == "other"
     # so far from the catalogue's form it may pass for unknown, never for the lag of another place
     assert body["which"]["verdict"] in (effect, "unknown")

@@ -16,5 +16,5 @@ from aeropend_sim.model.parameters import SAMPLE_PERIOD
     ("own_wake", "table", 201, "unknown"), ("own_wake", "table", 202, "unknown")])
 def test_half_a_minute_is_enough_to_tell_chance_from_what_nobody_knows(effect, form, seed, verdict):
     _, columns = cases.draw("short", "single", [effect], form, BENCH.model, BENCH.sensing, seed, 30.0)
-    body = diagnose(BENCH, [from_arrays(columns, SAMPLE_PERIOD, BENCH.sensing)], 2).body
+    body = diagnose(BENCH, [from_arrays(columns, SAMPLE_PERIOD, BENCH.sensing)]).body
     assert body["which"]["verdict"] == verdict

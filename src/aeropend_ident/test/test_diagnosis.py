@@ -35,7 +35,7 @@ def candidate(body, effect):
 @pytest.mark.promise("Verdict", "Every effect of the catalogue is named, with its place")
 @pytest.mark.parametrize("effect", CATALOGUE)
 def test_each_effect_is_named_placed_and_measured(effect):
-    body = diagnose(BENCH, [recorded(list(CATALOGUE).index(effect) + 50, {effect: {}})], 2).body
+    body = diagnose(BENCH, [recorded(list(CATALOGUE).index(effect) + 50, {effect: {}})]).body
     assert body["which"]["verdict"] == effect
     assert body["where"]["place"] == CATALOGUE[effect].place
     size = candidate(body, effect)["parameters"][CATALOGUE[effect].size]
@@ -51,14 +51,14 @@ def test_each_effect_is_named_placed_and_measured(effect):
 @pytest.mark.promise("Verdict", "Parameters within 5 % are refitted and count as no effect")
 @pytest.mark.parametrize("seed", range(4))
 def test_a_rig_whose_numbers_are_merely_a_little_off_has_no_effect(seed):
-    body = diagnose(BENCH, [recorded(seed)], 2).body
+    body = diagnose(BENCH, [recorded(seed)]).body
     assert (body["which"]["verdict"], body["which"]["effects"]) == ("none", [])
     assert body["shrink"]["gap_after"] < 1.2 * body["shrink"]["floor"]
 
 
 @pytest.mark.promise("Verdict", "Several effects are found; the one with the largest share of the gap comes first")
 def test_two_effects_in_different_places_are_both_found():
-    body = diagnose(BENCH, [recorded(71, {"coulomb_friction": {}, "brush_drop": {}})], 2).body
+    body = diagnose(BENCH, [recorded(71, {"coulomb_friction": {}, "brush_drop": {}})]).body
     assert set(body["which"]["effects"]) == {"coulomb_friction", "brush_drop"}
 
 
@@ -67,7 +67,7 @@ def test_friction_and_a_curve_of_thrust_are_found_to_a_part_in_a_thousand():
     effects = {"coulomb_friction": {"accel": 1.0}, "thrust_exponent": {"n": 2.15}}
     duty = Excitation(duration=60.0).series()
     columns, _ = rig.record(drawn_rig(0, effects, off=0.0), duty, 1)
-    body = diagnose(BENCH, [from_arrays(columns | {"duty": duty}, SAMPLE_PERIOD, BENCH.sensing)], 2).body
+    body = diagnose(BENCH, [from_arrays(columns | {"duty": duty}, SAMPLE_PERIOD, BENCH.sensing)]).body
     assert set(body["which"]["effects"]) == set(effects)
     assert candidate(body, "coulomb_friction")["parameters"]["accel"]["value"] == pytest.approx(1.0, abs=2e-3)
     assert candidate(body, "thrust_exponent")["parameters"]["n"]["value"] == pytest.approx(2.15, abs=2e-3)
@@ -77,7 +77,7 @@ def test_friction_and_a_curve_of_thrust_are_found_to_a_part_in_a_thousand():
 def beside_each_other(friction, drop):
     """A recording of a rig with friction and a voltage drop at the brushes, and its diagnosis."""
     signals = recorded(71, {"coulomb_friction": {"accel": friction}, "brush_drop": {"v_brush": drop}})
-    return signals, diagnose(BENCH, [signals], 2)
+    return signals, diagnose(BENCH, [signals])
 
 
 @pytest.mark.promise("Verdict", "Several effects are found; the one with the largest share of the gap comes first")
@@ -94,7 +94,7 @@ def test_the_effect_that_opens_more_of_the_gap_comes_first(friction, drop, first
 @pytest.mark.promise("Verdict", "An effect is claimed if its share of the gap is material; smaller ones are listed")
 def test_an_effect_that_makes_little_of_the_gap_is_small_unless_a_person_asks_for_it():
     signals, found = beside_each_other(0.2, 0.8)
-    usual, strict = found.conclusions.which, diagnose(BENCH, [signals], 2, material=0.0).conclusions.which
+    usual, strict = found.conclusions.which, diagnose(BENCH, [signals], material=0.0).conclusions.which
     assert (usual.effects, usual.small) == (("brush_drop",), ("coulomb_friction",))
     assert (strict.effects, strict.small) == (("brush_drop", "coulomb_friction"), ())
     assert [c.effect for c in usual.candidates if c.found] == ["brush_drop"]
@@ -111,7 +111,7 @@ def test_the_verdict_in_a_terminal_tells_the_shares_in_plain_characters():
 def with_false_speeds(seed, count):
     """A recording of a rig that is a little off, with some false speeds, each held until the next pulse."""
     rng = np.random.default_rng(seed)
-    duty = steps(40.0, seed)
+    duty = steps(28.0, seed)
     columns, _ = rig.record(drawn_rig(seed, {}), duty, seed)
     omega = columns["omega"].copy()
     pulses = np.flatnonzero(np.diff(omega)) + 1
@@ -123,7 +123,7 @@ def with_false_speeds(seed, count):
 
 @pytest.mark.promise("Verdict", "A few false speeds are left out and said; more are the effect `speed_spikes`")
 def test_a_few_false_speeds_leave_no_gap_open():
-    made = diagnose(BENCH, [with_false_speeds(11, 3)], 2)
+    made = diagnose(BENCH, [with_false_speeds(11, 3)])
     assert made.conclusions.which.verdict == "none"
     assert made.conclusions.closure.gap_after < 1.2 * made.conclusions.closure.floor
     assert any("3 false speeds left out" in note for s in made.signals for note in s.notes)
@@ -131,7 +131,7 @@ def test_a_few_false_speeds_leave_no_gap_open():
 
 @pytest.mark.promise("Verdict", "A few false speeds are left out and said; more are the effect `speed_spikes`")
 def test_some_more_false_speeds_are_the_effect():
-    made = diagnose(BENCH, [with_false_speeds(12, 8)], 2)
+    made = diagnose(BENCH, [with_false_speeds(12, 8)])
     assert made.conclusions.which.verdict == "speed_spikes"
     assert not any("false speeds" in note for s in made.signals for note in s.notes)
 
@@ -142,14 +142,14 @@ def test_a_channel_that_was_read_on_held_out_data_only_is_no_reason_to_fail(chan
     columns, _ = rig.record(drawn_rig(97, {"coulomb_friction": {}}), duty, 97)
     columns[channel] = np.where(np.arange(len(duty)) < 0.7 * len(duty), np.nan, columns[channel])
     signals = from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)
-    assert diagnose(BENCH, [signals], 2).conclusions.which.verdict == "coulomb_friction"
+    assert diagnose(BENCH, [signals]).conclusions.which.verdict == "coulomb_friction"
 
 
 @pytest.mark.promise("Verdict", "The numbers of the measurement chain have tolerances")
 @pytest.mark.parametrize("factor", [0.9, 1.1])
 def test_a_filter_within_its_tolerance_is_no_effect(factor):
     signals = filtered(factor)
-    body = diagnose(BENCH, [signals], 2).body
+    body = diagnose(BENCH, [signals]).body
     assert body["which"]["verdict"] == "none"
     row = body["which"]["numbers"]["sensing.angle_filter_tau"]
     assert row["low"] < factor * BENCH.sensing["angle_filter_tau"] < row["high"]
@@ -160,16 +160,16 @@ def test_a_filter_within_its_tolerance_is_no_effect(factor):
                                               ("speed_tick", 4.0), ("current_lsb", 2.0)])
 def test_a_measurement_chain_that_is_off_is_no_effect_of_the_rig(name, factor):
     sensing = {**BENCH.sensing, name: factor * BENCH.sensing[name]}
-    duty = steps(40.0, 96)
+    duty = steps(28.0, 96)
     columns, _ = rig.record(Model("rig", drawn_rig(96, {}).model, sensing), duty, 96)
-    which = diagnose(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)], 2).body["which"]
+    which = diagnose(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)]).body["which"]
     assert set(which["effects"]) <= {"encoder_lag"}
     assert which["verdict"] in {"none", "encoder_lag"}
 
 
 @pytest.mark.promise("Verdict", "The numbers of the measurement chain have tolerances")
 def test_a_filter_that_is_much_faster_is_a_negative_lag():
-    body = diagnose(BENCH, [filtered(0.2)], 2).body
+    body = diagnose(BENCH, [filtered(0.2)]).body
     assert body["which"]["verdict"] == "encoder_lag"
     tau = candidate(body, "encoder_lag")["parameters"]["tau"]
     assert tau["low"] < -0.8 * BENCH.sensing["angle_filter_tau"] < tau["high"] < 0.0
@@ -179,14 +179,14 @@ def filtered(factor):
     """A recording of a rig whose filter has another time constant than the model file states; fine resolution."""
     sensing = {**BENCH.sensing, "angle_filter_tau": factor * BENCH.sensing["angle_filter_tau"], "angle_lsb": 1e-4,
                "angle_noise": 2e-4}
-    duty = steps(40.0, 74)
+    duty = steps(28.0, 74)
     columns, _ = rig.record(Model("rig", BENCH.model, sensing), duty, 74)
     return from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, {**BENCH.sensing, "angle_lsb": 1e-4})
 
 
 @pytest.mark.promise("Verdict", "Several effects are found; the one with the largest share of the gap comes first")
 def test_two_effects_in_one_place_are_both_found():
-    body = diagnose(BENCH, [recorded(72, {"coulomb_friction": {}, "thrust_lag": {}})], 2).body
+    body = diagnose(BENCH, [recorded(72, {"coulomb_friction": {}, "thrust_lag": {}})]).body
     assert set(body["which"]["effects"]) == {"coulomb_friction", "thrust_lag"}
 
 
@@ -208,7 +208,7 @@ def test_the_most_harmful_effect_is_taken_out_alone_unless_the_gap_is_then_large
 
 
 def test_what_stays_open_is_unknown_though_the_joint_fit_closes_a_larger_misfit_elsewhere():
-    found = diagnose(BENCH, [recorded(71, {"voltage_offset": {"bias": 0.1}})], 2, left_out=["voltage_offset"])
+    found = diagnose(BENCH, [recorded(71, {"voltage_offset": {"bias": 0.1}})], left_out=["voltage_offset"])
     assert found.conclusions.closure.closed < 0.6
     assert found.body["which"]["verdict"] == "unknown"
 
@@ -225,7 +225,7 @@ def test_a_learned_term_replaces_effects_only_if_it_closes_materially_more(rms, 
 
 def test_effects_all_over_the_chain_are_found_and_nothing_else():
     effects = {"speed_spikes": {}, "brush_drop": {}, "coulomb_friction": {}}
-    body = diagnose(BENCH, [recorded(73, effects, duration=60.0)], 2).body
+    body = diagnose(BENCH, [recorded(73, effects, duration=60.0)]).body
     assert set(body["which"]["effects"]) == set(effects)
 
 
@@ -233,9 +233,9 @@ def far_off(number, factor):
     """The document of a rig with one parameter off by a factor."""
     model = drawn_rig(80, {})
     model = Model("rig", {**model.model, number: factor * BENCH.model[number]}, model.sensing)
-    duty = steps(40.0, 80)
+    duty = steps(28.0, 80)
     columns, _ = rig.record(model, duty, 80)
-    found = diagnose(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)], 2)
+    found = diagnose(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)])
     made = document(found, ["bag"], "bench", 0.0)
     assert made.which.verdict == "parameter_mismatch"
     return made
@@ -262,11 +262,11 @@ def test_two_numbers_of_which_the_product_counts_are_not_separable():
 
 def test_what_the_catalogue_does_not_hold_is_unknown():
     """The angle reading jumps by 0.08 rad now and then: a slipping coupling."""
-    duty = steps(40.0, 90)
+    duty = steps(28.0, 90)
     columns, _ = rig.record(drawn_rig(90, {}), duty, 90)
     jumps = np.cumsum(np.random.default_rng(1).choice([0.0, 0.08, -0.08], len(duty), p=[0.999, 0.0005, 0.0005]))
     columns["theta"] = columns["theta"] + jumps
-    body = diagnose(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)], 2).body
+    body = diagnose(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)]).body
     assert body["which"]["verdict"] == "unknown"
     assert body["which"]["effects"] == []  # no random torque moves the arm in jumps
 
@@ -274,7 +274,7 @@ def test_what_the_catalogue_does_not_hold_is_unknown():
 @pytest.mark.promise("Verdict", "Channels that were not measured leave a verdict on the others")
 @pytest.mark.parametrize("without", [("omega",), ("i_a", "v_a"), ("omega", "i_a", "v_a")])
 def test_missing_channels_leave_a_verdict_on_the_arm(without):
-    body = diagnose(BENCH, [recorded(95, {"coulomb_friction": {"accel": 1.5}}, off=0.005, without=without)], 2).body
+    body = diagnose(BENCH, [recorded(95, {"coulomb_friction": {"accel": 1.5}}, off=0.005, without=without)]).body
     assert set(body["channels"]) == {"theta", "omega", "i_a", "v_a"} - set(without)
     assert "coulomb_friction" in body["which"]["effects"]
 
@@ -288,8 +288,8 @@ def test_several_recordings_of_one_rig_are_fitted_together():
         duty = steps(25.0, seed)
         columns, _ = rig.record(model, duty, seed)
         signals.append(from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing))
-    both = diagnose(BENCH, signals, 2).body
-    one = diagnose(BENCH, signals[:1], 2).body
+    both = diagnose(BENCH, signals).body
+    one = diagnose(BENCH, signals[:1]).body
     assert both["which"]["effects"] == ["coulomb_friction"]
     width = [candidate(b, "coulomb_friction")["parameters"]["accel"] for b in (both, one)]
     assert width[0]["high"] - width[0]["low"] < width[1]["high"] - width[1]["low"]
@@ -298,13 +298,13 @@ def test_several_recordings_of_one_rig_are_fitted_together():
 @cache
 def with_friction():
     """The diagnosis of a rig with dry friction."""
-    return diagnose(BENCH, [recorded(97, {"coulomb_friction": {}})], 2)
+    return diagnose(BENCH, [recorded(97, {"coulomb_friction": {}})])
 
 
 @pytest.mark.parametrize("missing", [1000, 5000])
 def test_a_test_recording_whose_angle_comes_late_is_judged_from_there_on(missing):
     found = with_friction()
-    duty = steps(40.0, 99)
+    duty = steps(28.0, 99)
     columns, _ = rig.record(drawn_rig(97, {"coulomb_friction": {}}), duty, 99)
     columns["theta"] = columns["theta"].copy()
     columns["theta"][:missing] = np.nan
@@ -315,7 +315,7 @@ def test_a_test_recording_whose_angle_comes_late_is_judged_from_there_on(missing
 @pytest.mark.promise("Verdict", "A person says how long the search may take, and is told if it was too short")
 def test_a_search_ends_at_its_time_and_says_so():
     signals = recorded(71, {"coulomb_friction": {}, "brush_drop": {}}, duration=20.0)
-    none, long = (diagnose(BENCH, [signals], 2, seconds=s) for s in (0.0, 600.0))
+    none, long = (diagnose(BENCH, [signals], seconds=s) for s in (0.0, 600.0))
     assert none.conclusions.which.effects == ()
     assert none.conclusions.which.verdict == "cannot_tell"
     assert "any effect of the motor and of the arm was tried" in none.conclusions.which.unexplained[0]
@@ -331,7 +331,7 @@ def test_the_verdict_does_not_depend_on_the_number_of_threads():
 
 def test_the_augmented_model_runs_the_rig():
     signals = recorded(4, {"thrust_lag": {}})
-    result = diagnose(BENCH, [signals], 2)
+    result = diagnose(BENCH, [signals])
     columns, _ = rig.record(result.augmented, signals.duty, 1)
     assert np.sqrt(np.mean((columns["theta"] - signals.theta) ** 2)) < 2.0 * signals.sigma["theta"]
 
@@ -353,7 +353,7 @@ def test_what_is_held_out_moves_no_fit():
     spoilt = {name: x.copy() for name, x in columns.items()}
     for x in spoilt.values():
         x[round(0.9 * len(duty)):] *= 2.0
-    whole, other = (diagnose(BENCH, [from_arrays({**c, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)], 2).body
+    whole, other = (diagnose(BENCH, [from_arrays({**c, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)]).body
                     for c in (columns, spoilt))
     for one in (*whole["which"]["candidates"], *other["which"]["candidates"]):
         one.pop("gap_after")

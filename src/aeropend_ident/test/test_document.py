@@ -39,13 +39,13 @@ def free_decay(first, rate=20.0, every=5):
 
 @cache
 def calibrated():
-    found = diagnose(BENCH, [recorded(11, {"coulomb_friction": {}}, duration=16.0)], 2)
+    found = diagnose(BENCH, [recorded(11, {"coulomb_friction": {}}, duration=16.0)])
     across = Across("tuesday", 0.5, 0.1, 0.01, None, None, None)
     return document_of(found, ["monday"], "bench", 1.234, [across])
 
 
 def uncalibrated():
-    found = diagnose(BENCH, [free_decay(1.0), free_decay(0.8)], 2, fit_nominal=True)
+    found = diagnose(BENCH, [free_decay(1.0), free_decay(0.8)], fit_nominal=True)
     return document_of(found, ["one", "two"], "bench", 2.0)
 
 

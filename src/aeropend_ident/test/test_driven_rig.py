@@ -73,7 +73,7 @@ def test_the_scale_of_duty_and_time_changes_the_units_alone(time, duty):
 def test_dry_friction_of_a_slow_rig_is_found(gravity, friction):
     numbers = {"mgd_over_J": gravity, "c_over_J": 0.2, "L_over_J": BENCH.model["L_over_J"] * gravity / 33.8}
     s = driven(numbers, {"coulomb_friction": {"accel": friction}}, seconds=90.0, hold=(2.0, 9.0))
-    found = diagnose(BENCH, [s], 2, fit_nominal=True)
+    found = diagnose(BENCH, [s], fit_nominal=True)
     assert found.body["which"]["effects"] == ["coulomb_friction"]
     assert found.augmented.effect("coulomb_friction", "accel") == pytest.approx(friction, rel=0.05)
     assert found.augmented.model["mgd_over_J"] == pytest.approx(gravity, rel=0.02)
@@ -82,7 +82,7 @@ def test_dry_friction_of_a_slow_rig_is_found(gravity, friction):
 @pytest.mark.promise("Uncalibrated rigs", "Delay and zero of a rig are its own model and no effect")
 def test_delay_and_zero_are_the_rigs_own():
     s = driven({}, {"command_delay": {"delay": 0.1}}, zero=0.08)
-    body = diagnose(BENCH, [s], 2, fit_nominal=True).body
+    body = diagnose(BENCH, [s], fit_nominal=True).body
     assert body["which"]["verdict"] == "none"
     assert body["identified"]["own"]["command_delay.delay"]["value"] == pytest.approx(0.1, abs=0.02)
     assert body["identified"]["hangs_at"]["value"] == pytest.approx(0.08, abs=0.005)
@@ -132,7 +132,7 @@ def test_an_angle_that_is_read_as_it_should_be_is_not_touched():
 def test_a_rig_read_upside_down_gives_the_verdict_of_the_rig():
     effects = {"coulomb_friction": {"accel": 0.8}}
     s = driven(effects=effects, sign=-1.0)
-    found = diagnose(BENCH, [replace(s, theta=s.theta - 1.45)], 2, fit_nominal=True)
+    found = diagnose(BENCH, [replace(s, theta=s.theta - 1.45)], fit_nominal=True)
     assert found.conclusions.which.effects == ("coulomb_friction",)
     identified = found.conclusions.identified
     assert identified.mounting.flipped
@@ -144,7 +144,7 @@ def test_no_effect_is_named_where_the_unseen_part_is_not_predicted():
     s = driven(effects={"coulomb_friction": {"accel": 0.8}})
     other = s.theta.copy()
     other[s.train:] = 2.0 * np.mean(other[s.train:]) - other[s.train:]
-    body = diagnose(BENCH, [replace(s, theta=other)], 2, fit_nominal=True).body
+    body = diagnose(BENCH, [replace(s, theta=other)], fit_nominal=True).body
     assert (body["which"]["verdict"], body["which"]["effects"]) == ("cannot_tell", [])
     assert "does not predict the rig" in body["which"]["unexplained"][0]
     assert not any(c["found"] for c in body["which"]["candidates"])
@@ -161,7 +161,7 @@ def test_a_rest_at_the_end_is_left_out_and_one_between_is_not():
 @pytest.mark.promise("Uncalibrated rigs", "A thrust that falls more slowly than it rises is the rig's own model")
 def test_a_lag_that_differs_between_rise_and_fall_is_found():
     s = driven({}, {"thrust_lag": {"tau": 0.1, "fall": 4.0}}, seconds=40.0)
-    body = diagnose(BENCH, [s], 2, fit_nominal=True).body
+    body = diagnose(BENCH, [s], fit_nominal=True).body
     assert body["which"]["verdict"] == "none"
     assert body["identified"]["own"]["thrust_lag.fall"]["value"] == pytest.approx(4.0, rel=0.3)
     assert body["channels"]["theta"]["fit_unseen"] > 0.95

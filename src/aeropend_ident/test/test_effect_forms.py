@@ -28,7 +28,7 @@ TRUE = {"coulomb_friction_stribeck": {"accel": 0.8, "rise": 0.6, "speed": 0.3},
 @pytest.fixture(scope="module", params=TRUE)
 def verdict(request):
     """A rig with a form of an effect, and its diagnosis."""
-    return request.param, diagnose(BENCH, [recorded(71, {request.param: TRUE[request.param]}, duration=40.0)], 2)
+    return request.param, diagnose(BENCH, [recorded(71, {request.param: TRUE[request.param]}, duration=28.0)])
 
 
 def found_of(verdict):
@@ -75,7 +75,7 @@ def test_the_words_say_form_and_strength(verdict):
 
 
 def test_a_lag_of_one_stage_of_the_filter_is_one_of_the_encoder():
-    found = diagnose(BENCH, [recorded(73, {"encoder_lag_single": {"lag": 0.12}}, duration=40.0)], 2)
+    found = diagnose(BENCH, [recorded(73, {"encoder_lag_single": {"lag": 0.12}}, duration=28.0)])
     which = found.conclusions.which
     assert which.effects == ("encoder_lag",)
     lag = next(c for c in which.candidates if c.effect == "encoder_lag").parameters["lag"]
@@ -86,8 +86,8 @@ def test_a_form_of_an_effect_file_is_tried():
     effect_file.define({"test_forms_drag": {
         "place": "arm", "form_of": "quadratic_drag", "term": "-k * theta_dot * abs(theta_dot) * step(theta_dot)",
         "parameters": {"k": {"unit": "1/rad", "default": 0.6, "low": 0.0, "high": 20.0}}}}, "test")
-    signals = recorded(72, {"test_forms_drag": {"k": 1.5}}, duration=40.0)
-    with_, without = (diagnose(BENCH, [signals], 2, further=ids) for ids in (["test_forms_drag"], []))
+    signals = recorded(72, {"test_forms_drag": {"k": 1.5}}, duration=28.0)
+    with_, without = (diagnose(BENCH, [signals], further=ids) for ids in (["test_forms_drag"], []))
     assert with_.conclusions.which.verdict == "quadratic_drag"
     assert with_.augmented.effects["test_forms_drag"]["k"] == pytest.approx(1.5, rel=0.2)
     assert all(c.law != "test_forms_drag" for c in without.conclusions.which.candidates)

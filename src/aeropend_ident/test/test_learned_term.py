@@ -38,7 +38,7 @@ effect_file.define(HIDDEN, "test_learned_term")
 def verdict(request):
     """A rig with an effect that the catalogue does not hold, and its diagnosis."""
     signals = recorded(104, {request.param: {}}, duration=30.0)
-    return request.param, diagnose(BENCH, [signals], 2)
+    return request.param, diagnose(BENCH, [signals])
 
 
 @pytest.mark.promise("Verdict", "Where the verdict is `unknown`, the missing term is learned at its place, and its "
@@ -80,7 +80,7 @@ def test_a_formula_is_proposed_and_is_tomorrows_catalogue_entry(verdict, tmp_pat
     results.write(tmp_path / "out", overwrite=False)
     proposed = effect_file.load(tmp_path / "out" / "proposed.yaml")
     assert list(proposed) == [f.id for f in formulas]
-    again = diagnose(BENCH, [recorded(105, {id_: {}}, duration=30.0)], 2, further=[formulas[0].id])
+    again = diagnose(BENCH, [recorded(105, {id_: {}}, duration=30.0)], further=[formulas[0].id])
     assert again.conclusions.which.verdict == formulas[0].id
     assert again.conclusions.closure.closed > 0.9
 

@@ -16,7 +16,7 @@ from aeropend_ident.testing.rigs import BENCH, changing, recorded
     ("coulomb_friction", 14.3, np.inf), ("supply_sag", 0.0, 17.2), ("encoder_eccentricity", 20.1, np.inf),
     ("rotor_friction", 0.0, 11.7)])
 def test_when_an_effect_begins_or_ends(effect, since, until):
-    found = diagnose(BENCH, [changing(31, {effect: {}}, since, until)], 2).conclusions.which
+    found = diagnose(BENCH, [changing(31, {effect: {}}, since, until)]).conclusions.which
     assert found.effects == (effect,)
     (one,) = (c for c in found.candidates if c.found)
     (at, true), none = ((one.since, since), one.until) if since else ((one.until, until), one.since)
@@ -36,7 +36,7 @@ def test_an_instant_stays_away_from_the_ends_of_what_is_fitted(begins):
 
 
 def test_an_effect_that_acts_all_the_time_has_no_instant():
-    found = diagnose(BENCH, [recorded(31, {"coulomb_friction": {}})], 2).conclusions.which
+    found = diagnose(BENCH, [recorded(31, {"coulomb_friction": {}})]).conclusions.which
     assert found.effects == ("coulomb_friction",)
     assert all(c.since is None and c.until is None for c in found.candidates)
 
@@ -44,7 +44,7 @@ def test_an_effect_that_acts_all_the_time_has_no_instant():
 @pytest.mark.promise("Verdict", "A change in the last part of a recording is judged too")
 def test_a_change_in_the_part_that_is_held_out_at_first():
     signals = changing(32, {"coulomb_friction": {}}, since=29.5)
-    made = diagnose(BENCH, [signals], 2)
+    made = diagnose(BENCH, [signals])
     text = "\n".join(verdict_lines(document(made, ["bag"], "bench", 0.0)))
     assert made.conclusions.which.effects == ("coulomb_friction",)
     assert "begins at 29." in text

@@ -44,7 +44,7 @@ def verdict(columns, period=SAMPLE_PERIOD, notes=None):
     signals = from_arrays(columns, period, BENCH.sensing, name="my_bag")
     if notes is not None:
         notes += signals.notes
-    return diagnose(BENCH, [signals], 2).body["which"]
+    return diagnose(BENCH, [signals]).body["which"]
 
 
 @cache

@@ -83,19 +83,19 @@ def rendered(diagnosis, bags=("my_bag",), model="bench", command="diagnose my_ba
 @pytest.fixture(scope="module")
 def friction():
     """Diagnose 16 s of a rig with dry friction."""
-    return diagnose(BENCH, [recorded(11, {"coulomb_friction": {}}, duration=16.0)], 2)
+    return diagnose(BENCH, [recorded(11, {"coulomb_friction": {}}, duration=16.0)])
 
 
 @pytest.fixture(scope="module")
 def nominal():
     """Diagnose 15 s of a rig that lacks nothing."""
-    return diagnose(BENCH, [recorded(2, duration=15.0)], 2)
+    return diagnose(BENCH, [recorded(2, duration=15.0)])
 
 
 @pytest.fixture(scope="module")
 def several():
     """Diagnose 20 s of a rig with two effects."""
-    return diagnose(BENCH, [recorded(71, {"coulomb_friction": {}, "brush_drop": {}}, duration=20.0)], 2)
+    return diagnose(BENCH, [recorded(71, {"coulomb_friction": {}, "brush_drop": {}}, duration=20.0)])
 
 
 @pytest.fixture(scope="module")
@@ -108,14 +108,14 @@ def angle_only():
 @pytest.fixture(scope="module")
 def two():
     """Diagnose two recordings of one rig."""
-    return diagnose(BENCH, [recorded(12, {"coulomb_friction": {}}, duration=t) for t in (15.0, 18.0)], 2)
+    return diagnose(BENCH, [recorded(12, {"coulomb_friction": {}}, duration=t) for t in (15.0, 18.0)])
 
 
 @pytest.fixture(scope="module")
 def strange():
     """Diagnose 24 s of a rig whose arm is braked while it rises only: no effect of the catalogue."""
     columns = one_way_arm.recorded_columns(1, 24.0, 1.5)
-    return diagnose(BENCH, [from_arrays(columns, SAMPLE_PERIOD, BENCH.sensing)], 2)
+    return diagnose(BENCH, [from_arrays(columns, SAMPLE_PERIOD, BENCH.sensing)])
 
 
 @pytest.fixture(scope="module", params=["friction", "nominal", "several", "angle_only", "two", "strange"])

@@ -50,7 +50,7 @@ UNREADABLE = {
 @cache
 def short():
     """A diagnosis of which only the first samples are drawn."""
-    found = diagnose(BENCH, [recorded(11, {"coulomb_friction": {}}, duration=16.0)], 2)
+    found = diagnose(BENCH, [recorded(11, {"coulomb_friction": {}}, duration=16.0)])
     s = replace(found.signals[0].head(SHORT), train=SHORT // 2)
     cut = [[{c: x[:SHORT] for c, x in r.items()} for r in runs] for runs in (found.before, found.after)]
     return replace(found, signals=[s], before=cut[0], after=cut[1])

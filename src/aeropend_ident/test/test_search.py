@@ -182,7 +182,7 @@ def bent_current(columns, truth):
 @pytest.mark.promise(
     "Verdict", "An effect outside the catalogue is `unknown`, with its likeliest place and free curves")
 def test_what_the_catalogue_does_not_hold_is_unknown_with_its_place_and_its_curves():
-    body = diagnose(BENCH, [recording({}, 5, 20.0, bent_current)], 2).body
+    body = diagnose(BENCH, [recording({}, 5, 20.0, bent_current)]).body
     which = body["which"]
     assert (which["verdict"], which["effects"]) == ("unknown", [])
     assert body["where"]["place"] == which["unknown"]["place"] == "sensing"
@@ -195,7 +195,7 @@ def test_what_the_catalogue_does_not_hold_is_unknown_with_its_place_and_its_curv
 
 @pytest.mark.parametrize("effects", [{}, {"brush_drop": {}}])
 def test_what_the_catalogue_explains_leaves_nothing_unknown(effects):
-    which = diagnose(BENCH, [recording(effects, 5, 20.0)], 2).body["which"]
+    which = diagnose(BENCH, [recording(effects, 5, 20.0)]).body["which"]
     assert which["effects"] == list(effects)
     assert which["unknown"] is None
 
@@ -207,7 +207,7 @@ def test_readings_at_unsteady_instants_are_nothing_unknown(seed):
         late = np.random.default_rng(seed).uniform(-0.45, 0.45, len(truth["i_a"]))
         columns["i_a"] = columns["i_a"] + late * np.gradient(truth["i_a"])
 
-    diagnosis = diagnose(BENCH, [recording({}, seed, 20.0, unsteady)], 2)
+    diagnosis = diagnose(BENCH, [recording({}, seed, 20.0, unsteady)])
     left = diagnosis.body["which"]["residuals"]["i_a"]
     assert 1.1 < left["rms"] < 1.3
     assert diagnosis.body["which"]["verdict"] == "none"
@@ -220,7 +220,7 @@ def test_lags_are_told_apart_only_where_nothing_else_is_missing(seed):
         k = np.arange(len(truth["theta"]))
         columns["theta"] = columns["theta"] + 0.004 * np.sin(k / 97.0) + 0.003 * np.sin(k / 41.0)
 
-    clean, other = (diagnose(BENCH, [recording({"encoder_lag": {"tau": 0.03}}, seed, 20.0, read)], 2).body["which"]
+    clean, other = (diagnose(BENCH, [recording({"encoder_lag": {"tau": 0.03}}, seed, 20.0, read)]).body["which"]
                     for read in (lambda *_: None, rough))
     assert (clean["verdict"], clean["not_separable"]) == ("encoder_lag", [])
     (pair,) = other["not_separable"]

@@ -42,14 +42,14 @@ RIG = drawn_rig(3, {"coulomb_friction": {"accel": FRICTION}})
 @pytest.fixture(scope="module")
 def monday(tmp_path_factory):
     folder = tmp_path_factory.mktemp("verdicts") / "monday"
-    found = diagnose(BENCH, [recorded(RIG, 3)], 2)
+    found = diagnose(BENCH, [recorded(RIG, 3)])
     Results.of(found, document(found, ["monday"], "bench", 1.0), "diagnose monday").write(folder, overwrite=False)
     return folder
 
 
 def tuesday(monday, model: Model, seed: int = 503) -> Diagnosis:
     nominal, known, _ = since.read([monday])
-    return diagnose(nominal, [recorded(model, seed)], 2, known=known)
+    return diagnose(nominal, [recorded(model, seed)], known=known)
 
 
 @pytest.mark.promise("Verdict", "Nothing is claimed of a rig that has not changed")
@@ -68,11 +68,11 @@ def test_an_effect_whose_place_a_parameter_had_taken_is_no_change(damping, hidde
     """Viscous damping had taken the place of drag, or rose beside it, or stayed."""
     plain = drawn_rig(3, {})
     before = replace(plain, model={**plain.model, "c_over_J": plain.model["c_over_J"] + damping})
-    monday = diagnose(BENCH, [recorded(before, 3)], 2)
+    monday = diagnose(BENCH, [recorded(before, 3)])
     e = monday.conclusions.estimates
     known = Known(e.names, np.array(e.values), np.array(e.covariance), ("monday",))
     after = plain.with_effects({"quadratic_drag": {"k": 0.3}})
-    found = diagnose(monday.augmented, [recorded(after, 503)], 2, known=known).conclusions.since
+    found = diagnose(monday.augmented, [recorded(after, 503)], known=known).conclusions.since
     both = ["quadratic_drag.k", "c_over_J"]
     assert list(found.perhaps_before) == (both if hidden else [])
     assert found.claimed == ([] if hidden else both if damping else both[:1])
@@ -198,7 +198,7 @@ def test_a_gust_that_was_not_there_has_appeared(monday):
     e = found.conclusions.estimates
     assert e.values[e.names.index("gust.sigma")] == pytest.approx(1.5, rel=0.2)
     known = Known(e.names, np.array(e.values), np.array(e.covariance), ("windy",))
-    again = diagnose(found.augmented, [recorded(windy, 504)], 2, known=known).conclusions
+    again = diagnose(found.augmented, [recorded(windy, 504)], known=known).conclusions
     assert [c.name for c in again.since.changes if c.claimed] == []
 
 

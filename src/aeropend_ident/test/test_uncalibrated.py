@@ -51,7 +51,7 @@ def let_go(seconds, effects=None, gravity=40.0, damping=0.4, first=1.0, rate=20.
 
 
 def verdict(*signals: Signals):
-    return diagnose(BENCH, list(signals), 2, fit_nominal=True).body
+    return diagnose(BENCH, list(signals), fit_nominal=True).body
 
 
 def candidate(body, effect):
@@ -145,7 +145,7 @@ def test_friction_that_varies_from_decay_to_decay_has_the_interval_of_its_mean()
     swings = [from_uncalibrated(recording(*let_go(20.0, {"coulomb_friction": {"accel": friction}}, damping=0.15, seed=k,
                                                   rate=50.0, lsb=0.2 * DEGREE)), BENCH.sensing)
               for k, friction in enumerate(true)]
-    body = diagnose(BENCH, swings, 2, fit_nominal=True).body
+    body = diagnose(BENCH, swings, fit_nominal=True).body
     assert body["which"]["effects"] == ["coulomb_friction"]
     accel = candidate(body, "coulomb_friction")["parameters"]["accel"]
     assert accel["low"] < np.mean(true) < accel["high"]
@@ -173,7 +173,7 @@ def test_a_clock_that_wanders_is_no_effect(wander):
 def test_the_gap_on_another_recording_is_that_of_the_identified_model():
     first, other = (from_uncalibrated(recording(*let_go(8.0, first=a, seed=k)), BENCH.sensing)
                     for k, a in enumerate((1.0, 0.7)))
-    found = diagnose(BENCH, [first], 2, fit_nominal=True)
+    found = diagnose(BENCH, [first], fit_nominal=True)
     identified, guessed = (validate(m, found.augmented, other) for m in (found.model, BENCH))
     assert identified.gap < 1.5 * identified.floor
     assert guessed.gap > 5.0 * identified.gap
@@ -295,7 +295,7 @@ def test_a_search_that_is_cut_short_says_so(monkeypatch):
     _, read = unknown(3, {"coulomb_friction": {"accel": 0.8}}, duration=8.0)
     signals = from_uncalibrated(read, BENCH.sensing)
     monkeypatch.setattr(policy, "UNCALIBRATED", replace(policy.UNCALIBRATED, budget=1))
-    result = diagnose(BENCH, [signals], 2, fit_nominal=True)
+    result = diagnose(BENCH, [signals], fit_nominal=True)
     assert any("cut short" in note for note in result.signals[0].notes)
     json.dumps(result.body, allow_nan=False)
 

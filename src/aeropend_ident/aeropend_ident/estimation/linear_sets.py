@@ -70,7 +70,8 @@ class LinearSets:
             prior: (P, P) its information matrix.
         """
         at, of = np.array(columns, np.intp), np.array([*fixed, -1], np.intp) % self.products.shape[1]
-        step, inner, likelihood = _estimate(self.products, self.count, self.weight, at, unit, of, prior, prior @ mean)
+        step, inner, likelihood = _estimate(self.products, self.count, self.weight, at, unit, of, prior, prior @ mean,
+                                            STEPS, SETTLED)
         information, off = inner + prior, step - mean
         occam = 0.5 * float(np.linalg.slogdet(prior)[1] - off @ prior @ off - np.linalg.slogdet(information)[1])
         return Solution(step, likelihood + occam)
@@ -78,7 +79,7 @@ class LinearSets:
 
 @njit(nogil=True)
 def _estimate(products: Array, count: Array, weight: Array, at: NDArray[np.intp], unit: Array, of: NDArray[np.intp],
-              prior: Array, pull: Array) -> tuple[Array, Array, float]:
+              prior: Array, pull: Array, steps: int, settled: float) -> tuple[Array, Array, float]:
     """The MAP estimate of a subset, by steps that renew the noise of the bands.
 
     Args:
@@ -90,6 +91,8 @@ def _estimate(products: Array, count: Array, weight: Array, at: NDArray[np.intp]
         of: (R,) columns whose sum is explained.
         prior: (P, P) information matrix of the prior.
         pull: (P,) that matrix times the means.
+        steps: at most.
+        settled: [nats] change of the log likelihood at which they end.
 
     Returns:
         Factors (P,), weighted products (P, P) of the columns, and log likelihood.
@@ -109,7 +112,7 @@ def _estimate(products: Array, count: Array, weight: Array, at: NDArray[np.intp]
                 rest[b] += products[b, one, other]
     step, power = np.zeros(size), np.maximum(rest, 0.0) / count
     likelihood = band_log_likelihood(power, count)
-    for _ in range(STEPS):
+    for _ in range(steps):
         information, gradient = prior.copy(), pull.copy()
         for b in range(bands_):
             w = 1.0 / max(power[b], 1.0)
@@ -126,6 +129,6 @@ def _estimate(products: Array, count: Array, weight: Array, at: NDArray[np.intp]
                     left += step[j] * inner[b, j, k] * step[k]
             power[b] = max(left, 0.0) / count[b]
         before, likelihood = likelihood, band_log_likelihood(power, count)
-        if abs(likelihood - before) < SETTLED:
+        if abs(likelihood - before) < settled:
             break
     return step, weighted, likelihood
