@@ -15,7 +15,7 @@ from aeropend_sim.model.parameters import SAMPLE_PERIOD, from_flat, load
 
 BENCH = load("bench")
 LINEAR = from_flat({"model.v_full": 2.4, "model.reverse": 1.0}, base=BENCH)
-DUTY = Excitation(duration=45.0, seed=4, duty_min=-0.5, duty_max=0.6).series()
+DUTY = Excitation(duration=36.0, seed=4, duty_min=-0.5, duty_max=0.6).series()
 T = np.arange(len(DUTY)) * SAMPLE_PERIOD
 FRICTION = 0.8
 

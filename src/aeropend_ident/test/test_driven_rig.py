@@ -72,7 +72,7 @@ def test_the_scale_of_duty_and_time_changes_the_units_alone(time, duty):
 @pytest.mark.parametrize(("gravity", "friction"), [(1.7, 0.03), (4.3, 0.05)])
 def test_dry_friction_of_a_slow_rig_is_found(gravity, friction):
     numbers = {"mgd_over_J": gravity, "c_over_J": 0.2, "L_over_J": BENCH.model["L_over_J"] * gravity / 33.8}
-    s = driven(numbers, {"coulomb_friction": {"accel": friction}}, seconds=90.0, hold=(2.0, 9.0))
+    s = driven(numbers, {"coulomb_friction": {"accel": friction}}, seconds=60.0, hold=(2.0, 9.0))
     found = diagnose(BENCH, [s], fit_nominal=True)
     assert found.body["which"]["effects"] == ["coulomb_friction"]
     assert found.augmented.effect("coulomb_friction", "accel") == pytest.approx(friction, rel=0.05)

@@ -238,7 +238,7 @@ def unknown(seed, effects=None, duration=30.0, factor=0.5, lever=1.0, **kept):
 @pytest.mark.promise(
     "Uncalibrated rigs", "Gravity, damping, zero and lever are each recording's own, with their run-to-run spread")
 def test_the_lever_is_each_runs_own():
-    read = [unknown(4, duration=15.0, lever=lever)[1] for lever in (1.0, 1.2, 0.9)]
+    read = [unknown(4, duration=10.0, lever=lever)[1] for lever in (1.0, 1.2, 0.9)]
     assert verdict(*(from_uncalibrated(r, BENCH.sensing) for r in read))["which"]["verdict"] == "none"
 
 
@@ -271,7 +271,7 @@ def test_chance_is_not_taken_for_what_it_looks_like():
 
 def test_what_a_misled_model_leaves_is_not_taken_for_chance():
     """An arm that turns over and over: the search for its numbers ends elsewhere, and no effect is to blame."""
-    _, read = unknown(7)
+    _, read = unknown(7, duration=18.0)
     assert np.ptp(read.theta) > 8.0 * math.pi
     assert verdict(from_uncalibrated(read, BENCH.sensing))["which"]["effects"] == []
 
