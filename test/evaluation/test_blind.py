@@ -13,7 +13,7 @@ from aeropend_ident.signals.signals import from_arrays
 from aeropend_ident.testing.rigs import BENCH
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
-SEED, COUNT, DURATION, PROCESSES = 4242, 18, 25.0, 1
+SEED, COUNT, DURATION, PROCESSES = 4242, 18, 18.0, 1
 
 pytestmark = pytest.mark.timeout(1200)
 
