@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The verdict goes by the parts of the gap."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -45,6 +47,15 @@ def test_effects_that_stand_in_for_each_other_have_parts_that_add_up_to_what_the
     assert [p.amount for p in gap_share._adding_up(alike, -1.0)] == [p.amount for p in alike]
     alone = part("gust", -0.1)
     assert [p.amount for p in gap_share._adding_up([alone], -0.1)] == [-0.1]
+
+
+def test_what_another_effect_could_close_is_not_claimed():
+    imitates, real = replace(part("angle_offset", 3.0), alone=0.01), replace(part("thrust_lag", 1.0), alone=2.0)
+    parts = [imitates, real]
+    head = headline(parts, shares(parts), 0.03)
+    assert (head.verdict, head.effects, head.small) == ("thrust_lag", ["thrust_lag"], ["angle_offset"])
+    parts = [imitates, replace(real, alone=0.01)]  # each could close what the other does
+    assert headline(parts, shares(parts), 0.03).effects == ["angle_offset"]
 
 
 def test_false_captures_do_not_count_in_the_shares_of_others():

@@ -59,6 +59,7 @@ class Part:
         windows: (W,) the same over each window of the bootstrap.
         unsure: relative standard deviation of the size of the effect.
         ends: least and most that it may be, as effects stand in for each other.
+        alone: what comes back without it although all other effects are fitted again: no other effect closes that.
     """
 
     name: str
@@ -67,6 +68,7 @@ class Part:
     windows: Array
     unsure: float = 0.0
     ends: tuple[float, float] = (math.inf, -math.inf)
+    alone: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,8 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
     with ThreadPoolExecutor(jobs) as pool:
         found = pool.map(lambda gone: held_out.gap_of(joint.without(gone)), subsets.values())
         gaps = {frozenset(): after, **dict(zip(subsets, found, strict=True))}
+        only = dict(zip((h.name for h in every), pool.map(
+            lambda h: squared(held_out.gap_of(joint.without([h], others=True))) - squared(after), every), strict=True))
 
     def gap(effects: Sequence[Hypothesis]) -> Gap:
         return gaps[_names(effects)]
@@ -126,7 +130,7 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
                                                      (every, _but(every, effect))))
         amounts = [p.amount for p in (last, first, alone)]
         return replace(last, amount=0.5 * (last.amount + first.amount), windows=0.5 * (last.windows + first.windows),
-                       ends=(min(amounts), max(amounts)))
+                       ends=(min(amounts), max(amounts)), alone=only[effect.name])
 
     return [p for effects in stages for p in _adding_up(
         [part(h, effects) for h in effects], squared(gap(effects)) - squared(after))]
@@ -249,14 +253,16 @@ def headline(parts: Sequence[Part], share: Mapping[str, Interval], material: flo
     Args:
         parts: of the gap.
         share: of `shares`.
-        material: share from which the largest finding is claimed, if its interval is above 0; a further effect, if it
-            is surely there. How much it closes depends on the others; whether it is there does not, so that the
-            ends of its part do not count.
+        material: share from which a finding is claimed, if its interval is above 0, and if no other effect could close
+            as much of it: a material share must come back without it. Of effects that stand in for each other so
+            far that none does, the largest is claimed. A further effect must also surely be there.
     """
     named = sorted((p for p in parts if p.name), key=lambda p: -p.amount)
     scatter = shares(parts, shared=0.0, ends=False)
     likely = [p for p in named if p.name in share and share[p.name].value >= material
               and (p.name == UNKNOWN or scatter[p.name].low > 0.0)]
+    least = material * sum(max(p.amount, 0.0) for p in parts if p.name != CAPTURES)
+    likely = [p for p in likely if p.name == UNKNOWN or p.alone >= least] or likely[:1]
     sure = shares(parts, ends=False) if len(likely) > 1 else {}
     claimed = [p for p in likely if p is likely[0] or p.name == UNKNOWN or sure[p.name].low >= SURELY * material]
     effects = _ids(p for p in claimed if p.name != UNKNOWN)

@@ -94,7 +94,7 @@ class JointFit:
     sd: dict[str, float]
     checks: dict[str, Check]
     alone: dict[str, tuple[Estimate, ...]] = field(default_factory=dict)
-    _fitted_without: dict[frozenset[str], dict[str, float]] = field(default_factory=dict, repr=False)
+    _fitted_without: dict[tuple[frozenset[str], bool], dict[str, float]] = field(default_factory=dict, repr=False)
 
     @property
     def parameters(self) -> dict[str, Parameter]:
@@ -107,21 +107,26 @@ class JointFit:
         own = not self.chains.policy.calibrated
         return {n: v for n, v in self.values.items() if own or key(n).is_initial or not key(n).recording}
 
-    def without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
-        """The values that leave the smallest gap without some of the effects, the others at their sizes.
+    def without(self, effects: Collection[Hypothesis], *, others: bool = False) -> dict[str, float]:
+        """The values that leave the smallest gap without some of the effects.
 
         Calibrated parameters stay within their tolerances. What comes back is what no parameter of the model could take
         over. The values are fitted once.
-        """
-        names = frozenset(h.name for h in effects)
-        if names not in self._fitted_without:
-            self._fitted_without[names] = self._fit_without(effects)
-        return self._fitted_without[names]
 
-    def _fit_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
+        Args:
+            effects: that are taken out.
+            others: whether the other effects are fitted again too; else they stay at their sizes.
+        """
+        what = frozenset(h.name for h in effects), others
+        if what not in self._fitted_without:
+            self._fitted_without[what] = self._fit_without(effects, others=others)
+        return self._fitted_without[what]
+
+    def _fit_without(self, effects: Collection[Hypothesis], *, others: bool) -> dict[str, float]:
         gone = {p.name for h in effects for p in h.own}
-        held = {n: self.values[n] for n in self._of_effects - gone}
-        free = [j for j, p in enumerate(self._bounded) if p.name not in self._of_effects
+        fixed = gone if others else self._of_effects
+        held = {n: self.values[n] for n in fixed - gone}
+        free = [j for j, p in enumerate(self._bounded) if p.name not in fixed
                 or (p.name in gone and p.name in self._nominal)]
         parameters = [self._back(p) if p.name in gone else p for p in (self._bounded[j] for j in free)]
         slopes = {channel: s.of(free) for channel, s in self._slopes.items()}
