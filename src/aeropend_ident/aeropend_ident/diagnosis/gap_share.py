@@ -115,8 +115,10 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
     with ThreadPoolExecutor(jobs) as pool:
         found = pool.map(lambda gone: held_out.gap_of(joint.without(gone)), subsets.values())
         gaps = {frozenset(): after, **dict(zip(subsets, found, strict=True))}
-        only = dict(zip((h.name for h in every), pool.map(
-            lambda h: squared(held_out.gap_of(joint.without([h], others=True))) - squared(after), every), strict=True))
+        # these fits hold no prior: what an earlier verdict knows may exclude that another effect closes it
+        tried = every if joint.chains.known is None else []
+        only = dict(zip((h.name for h in tried), pool.map(
+            lambda h: squared(held_out.gap_of(joint.without([h], others=True))) - squared(after), tried), strict=True))
 
     def gap(effects: Sequence[Hypothesis]) -> Gap:
         return gaps[_names(effects)]
@@ -130,7 +132,7 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
                                                      (every, _but(every, effect))))
         amounts = [p.amount for p in (last, first, alone)]
         return replace(last, amount=0.5 * (last.amount + first.amount), windows=0.5 * (last.windows + first.windows),
-                       ends=(min(amounts), max(amounts)), alone=only[effect.name])
+                       ends=(min(amounts), max(amounts)), alone=only.get(effect.name, math.inf))
 
     return [p for effects in stages for p in _adding_up(
         [part(h, effects) for h in effects], squared(gap(effects)) - squared(after))]
