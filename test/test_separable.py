@@ -78,7 +78,7 @@ def test_both_are_named_and_the_experiment_advised_tells_them_apart(case):
     assert first[0].partition(":")[0] in advice["why"]
 
     better = recorded(model, Excitation(**advice["excite"]).series(), case.seed)
-    for recordings in ([better], [poor, better])[:1 + (case in CASES[::2])]:  # both together take longest
+    for recordings in ([better], [poor, better]):
         body = diagnose(BENCH, recordings).body
         name, probability, claimed = names(body)[0]
         assert (name, claimed) == (case.truth, True)

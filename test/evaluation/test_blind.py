@@ -13,7 +13,7 @@ from aeropend_ident.signals.signals import from_arrays
 from aeropend_ident.testing.rigs import BENCH
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
-SEED, COUNT, DURATION, PROCESSES = 4242, 18, 18.0, 1
+SEED, COUNT, DURATION, PROCESSES = 4242, 24, 18.0, 1
 
 pytestmark = pytest.mark.timeout(1200)
 
@@ -39,7 +39,7 @@ def pairs(checked):
 
 def test_every_recording_got_a_verdict(checked):
     _, labels, verdicts = checked
-    assert len(labels) == len(verdicts) == len(check.plan(COUNT, SEED)) > 15
+    assert len(labels) == len(verdicts) == len(check.plan(COUNT, SEED)) > 20
     assert {label["kind"] for label in labels} == set(score.KINDS)
     assert not [v["error"] for v in verdicts.values() if "error" in v]
 

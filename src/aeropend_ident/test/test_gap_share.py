@@ -50,11 +50,11 @@ def test_effects_that_stand_in_for_each_other_have_parts_that_add_up_to_what_the
 
 
 def test_what_another_effect_could_close_is_not_claimed():
-    imitates, real = replace(part("angle_offset", 3.0), alone=0.01), replace(part("thrust_lag", 1.0), alone=2.0)
+    imitates, real = replace(part("angle_offset", 3.0), unique=0.01), replace(part("thrust_lag", 1.0), unique=2.0)
     parts = [imitates, real]
     head = headline(parts, shares(parts), 0.03)
     assert (head.verdict, head.effects, head.small) == ("thrust_lag", ["thrust_lag"], ["angle_offset"])
-    parts = [imitates, replace(real, alone=0.01)]  # each could close what the other does
+    parts = [imitates, replace(real, unique=0.01)]  # each could close what the other does
     assert headline(parts, shares(parts), 0.03).effects == ["angle_offset"]
 
 

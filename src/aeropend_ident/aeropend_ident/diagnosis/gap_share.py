@@ -59,7 +59,7 @@ class Part:
         windows: (W,) the same over each window of the bootstrap.
         unsure: relative standard deviation of the size of the effect.
         ends: least and most that it may be, as effects stand in for each other.
-        alone: what comes back without it although all other effects are fitted again: no other effect closes that.
+        unique: what comes back without it although all other effects are fitted again: no other effect closes that.
     """
 
     name: str
@@ -68,7 +68,7 @@ class Part:
     windows: Array
     unsure: float = 0.0
     ends: tuple[float, float] = (math.inf, -math.inf)
-    alone: float = math.inf
+    unique: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
         gaps = {frozenset(): after, **dict(zip(subsets, found, strict=True))}
         # these fits hold no prior: what an earlier verdict knows may exclude that another effect closes it
         tried = every if joint.chains.known is None else []
-        only = dict(zip((h.name for h in tried), pool.map(
+        unique = dict(zip((h.name for h in tried), pool.map(
             lambda h: squared(held_out.gap_of(joint.without([h], others=True))) - squared(after), tried), strict=True))
 
     def gap(effects: Sequence[Hypothesis]) -> Gap:
@@ -132,7 +132,7 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
                                                      (every, _but(every, effect))))
         amounts = [p.amount for p in (last, first, alone)]
         return replace(last, amount=0.5 * (last.amount + first.amount), windows=0.5 * (last.windows + first.windows),
-                       ends=(min(amounts), max(amounts)), alone=only.get(effect.name, math.inf))
+                       ends=(min(amounts), max(amounts)), unique=unique.get(effect.name, math.inf))
 
     return [p for effects in stages for p in _adding_up(
         [part(h, effects) for h in effects], squared(gap(effects)) - squared(after))]
@@ -222,8 +222,8 @@ def shares(parts: Sequence[Part], *, shared: float = SHARED, ends: bool = True, 
         seed: of the bootstrap.
     """
     captures = {p.name: Interval(1.0, 1.0, 1.0) for p in parts if p.name == CAPTURES and p.amount > 0.0}
+    total = _whole(parts)
     parts = [p for p in parts if p.name != CAPTURES]
-    total = sum(max(p.amount, 0.0) for p in parts)
     if total <= 0.0:
         return captures
     rng = np.random.default_rng(seed)
@@ -249,6 +249,11 @@ def shares(parts: Sequence[Part], *, shared: float = SHARED, ends: bool = True, 
     return found
 
 
+def _whole(parts: Sequence[Part]) -> float:
+    """The sum of the parts of the gap, without that of false captures."""
+    return sum(max(p.amount, 0.0) for p in parts if p.name != CAPTURES)
+
+
 def headline(parts: Sequence[Part], share: Mapping[str, Interval], material: float) -> Headline:
     """The verdict: the finding with the largest part of the gap.
 
@@ -263,8 +268,8 @@ def headline(parts: Sequence[Part], share: Mapping[str, Interval], material: flo
     scatter = shares(parts, shared=0.0, ends=False)
     likely = [p for p in named if p.name in share and share[p.name].value >= material
               and (p.name == UNKNOWN or scatter[p.name].low > 0.0)]
-    least = material * sum(max(p.amount, 0.0) for p in parts if p.name != CAPTURES)
-    likely = [p for p in likely if p.name == UNKNOWN or p.alone >= least] or likely[:1]
+    least = material * _whole(parts)
+    likely = [p for p in likely if p.name == UNKNOWN or p.unique >= least] or likely[:1]
     sure = shares(parts, ends=False) if len(likely) > 1 else {}
     claimed = [p for p in likely if p is likely[0] or p.name == UNKNOWN or sure[p.name].low >= SURELY * material]
     effects = _ids(p for p in claimed if p.name != UNKNOWN)

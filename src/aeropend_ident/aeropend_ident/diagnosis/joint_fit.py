@@ -117,15 +117,16 @@ class JointFit:
             effects: that are taken out.
             others: whether the other effects are fitted again too; else they stay at their sizes.
         """
+        gone = {p.name for h in effects for p in h.own}
+        others = others and not self._of_effects <= gone  # without others both are the same fit
         what = frozenset(h.name for h in effects), others
         if what not in self._fitted_without:
-            self._fitted_without[what] = self._fit_without(effects, others=others)
+            self._fitted_without[what] = self._fit_without(gone, others=others)
         return self._fitted_without[what]
 
-    def _fit_without(self, effects: Collection[Hypothesis], *, others: bool) -> dict[str, float]:
-        gone = {p.name for h in effects for p in h.own}
+    def _fit_without(self, gone: Collection[str], *, others: bool) -> dict[str, float]:
         fixed = gone if others else self._of_effects
-        held = {n: self.values[n] for n in fixed - gone}
+        held = {n: self.values[n] for n in fixed if n not in gone}
         free = [j for j, p in enumerate(self._bounded) if p.name not in fixed
                 or (p.name in gone and p.name in self._nominal)]
         parameters = [self._back(p) if p.name in gone else p for p in (self._bounded[j] for j in free)]

@@ -132,8 +132,9 @@ class Judge:
         self.chains, self.material = chains, material
         self.linear = LinearStages(chains)
         self.free = FreeRuns(chains, self.linear.parameters)
-        self._changed = stages_of(self.chains, [h for h in hypotheses if not h.parameter])
-        self.acts_on = {h.name: self._stages(h) for h in hypotheses}
+        changed = stages_of(self.chains, [h for h in hypotheses if not h.parameter])
+        self.acts_on = {h.name: self._measured(self._shown_by(h) if h.parameter else changed[h.name])
+                        for h in hypotheses}
         self.hypotheses = list(hypotheses)
         self._noise: dict[tuple[str, ...], list[dict[str, float]]] = {}
         rng = np.random.default_rng(SEED)
@@ -142,12 +143,13 @@ class Judge:
 
     # ---- hypotheses
 
-    def _stages(self, h: Hypothesis) -> tuple[str, ...]:
-        """The stages with a measured channel whose residuals a hypothesis changes."""
-        if h.parameter:
-            shown = {self.linear.stage_of[c] for c in self.linear.column_of(h.parameter).rows}
-            return tuple(b for b in self.linear.stages if b in shown)
-        return tuple(b for b in self._changed[h.name] if b in self.linear.stages)
+    def _shown_by(self, h: Hypothesis) -> set[str]:
+        """The stages whose residuals a parameter changes."""
+        return {self.linear.stage_of[c] for c in self.linear.column_of(h.parameter).rows}
+
+    def _measured(self, stages: Collection[str]) -> tuple[str, ...]:
+        """Those of some stages that have a measured channel."""
+        return tuple(b for b in self.linear.stages if b in stages)
 
     @cached_property
     def rivals(self) -> dict[str, tuple[list[Rival], Screening]]:

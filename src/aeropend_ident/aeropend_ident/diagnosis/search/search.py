@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import reduce
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import expit
@@ -112,7 +113,7 @@ def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], No
     stages = stages_of(chains, everything)
     acts_on = {h.family: stages[h.name] for h in everything}
     carried: dict[str, Parameter] = {}
-    bases = {stage: f.final for stage, f in (nominal or {}).items()}
+    bases, following = {stage: f.final for stage, f in (nominal or {}).items()}, dict(pairwise(STAGES))
     with ThreadPoolExecutor(jobs) as pool:
         for done, stage in enumerate(STAGES):
             progress(stage, done / len(STAGES))
@@ -120,7 +121,7 @@ def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], No
             f = _search_stage(chains, stage, mine, acts_on, list(carried.values()), bases, trifle, pool, deadline)
             findings[stage] = f
             if f.final is not bases.get(stage):  # the input of the next stage changes
-                bases = {b: base for b, base in bases.items() if b not in list(STAGES)[done + 1:done + 2]}
+                bases.pop(following.get(stage, ""), None)
             # an effect that acts on later stages too goes along, with the uncertainty that it has here
             for h in f.effects:
                 if len(acts_on[h.family]) > 1:
@@ -154,17 +155,19 @@ def trifling_gap(chains: CutChains, nominal: Mapping[str, Findings]) -> float:
 def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
                   acts_on: Mapping[str, tuple[str, ...]], carried: list[Parameter], bases: Mapping[str, Fit],
                   trifle: float, pool: ThreadPoolExecutor, deadline: float | None) -> Findings:
-    def fitted(b: str, parameters: Sequence[Parameter]) -> Fit:
+    def base_of(b: str, parameters: Sequence[Parameter]) -> Fit:
+        if b in bases and not (b == stage and carried):
+            return bases[b]
         return fit(chains.residuals(b), parameters, least_ess=chains.policy.least_ess, deadline=deadline)
 
     nominal: list[Parameter] = [*nominal_parameters(chains, stage), *carried]
-    base = bases[stage] if stage in bases and not carried else fitted(stage, nominal)
+    base = base_of(stage, nominal)
     findings = Findings(stage, base, base)
     if not base.residuals:
         return findings
     candidates = [delay_from_voltage(chains, h, base.values) for h in candidates]
     others = {b for h in candidates for b in acts_on[h.family] if b != stage}
-    downstream = {b: bases[b] if b in bases else fitted(b, nominal_parameters(chains, b)) for b in others}
+    downstream = {b: base_of(b, nominal_parameters(chains, b)) for b in others}
     known, supported, gained = nominal, findings, 0.0
     in_sets = chains.policy.calibrated and chains.known is None
     while len(findings.found) < (1 if in_sets else MOST_EFFECTS):
