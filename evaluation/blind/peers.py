@@ -24,7 +24,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 from threadpoolctl import threadpool_limits
 
-from aeropend_ident.diagnosis import free_run_gap
+from aeropend_ident.diagnosis.chain.free_run import free_run
 from aeropend_ident.diagnosis.chain.values import PLACE_OF_PARAMETER
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import actuator
@@ -367,7 +367,7 @@ class OutputError:
         """Residuals in units of their noise: three averaged channels, and the speed where its pulses show."""
         s = self.signals
         values = {c.name: c.value(z) for c, z in zip(coordinates, x)}
-        simulated = free_run_gap.free_run(self.model, s, values)
+        simulated = free_run(self.model, s, values)
         out = []
         for name in ("v_a", "i_a", "theta"):
             error = np.nan_to_num((s.channel(name) - simulated[name]) / s.sigma[name], posinf=1e9, neginf=-1e9)

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
+from aeropend_ident.diagnosis.chain.free_run import free_run
 from aeropend_ident.diagnosis.experiment_design import LONGEST, SEPARATE, advise, distances, next_experiment
-from aeropend_ident.diagnosis.free_run_gap import free_run
 from aeropend_ident.signals.signals import Signals
 from aeropend_ident.testing.rigs import BENCH, recorded
 from aeropend_sim.model.excitation import Excitation

@@ -2,7 +2,8 @@
 import numpy as np
 import pytest
 
-from aeropend_ident.diagnosis.free_run_gap import closure, floor, free_run, gap
+from aeropend_ident.diagnosis.chain.free_run import free_run
+from aeropend_ident.diagnosis.free_run_gap import closure, floor, gap
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, recorded
 
 

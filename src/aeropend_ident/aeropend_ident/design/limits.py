@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from aeropend_ident.diagnosis.chain.free_run import free_run
 from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD, TOLERANCE
-from aeropend_ident.diagnosis.free_run_gap import free_run
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.errors import UserError
 from aeropend_sim.model.parameters import MODEL_NAMES, Model

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.design.limits import LimitError, Ranges, reach_of
+from aeropend_ident.diagnosis.chain.free_run import StagedRun
 from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD, SIZE_SD, TOLERANCE, usual_size
 from aeropend_ident.diagnosis.experiment_design import PlannedReadings, unread
-from aeropend_ident.diagnosis.free_run_gap import free_run
 from aeropend_ident.diagnosis.search.hypotheses import MISMATCH_SD, hypotheses
 from aeropend_ident.estimation.parameter import Parameter
 from aeropend_ident.signals.signals import Signals
@@ -129,21 +129,22 @@ class Rows:
         """
         planned = PlannedReadings.under(self.model, self.signals, duty)
         whole = after(self.signals, duty)
-        base, others = self._with_numbers(whole)
+        run = StagedRun(self.model, whole)
+        base, others = self._with_numbers(run)
         here = planned.stacked(base)
         rows = [(planned.stacked(moved) - here) / STEP for moved in others]
         unsure = _unsure(base, others)
         reach = _around(base, unsure)
         with_ = {}
         for name, e in self.effects.items():
-            moved = free_run(self.model, whole, e.values)
+            moved = run.readings(e.values)
             with_[name] = planned.stacked(moved)
             rows.append(with_[name] - here)
             own = _around(moved, unsure)
             reach = {c: (min(reach[c][0], own[c][0]), max(reach[c][1], own[c][1])) for c in reach}
         for name, e in self.effects.items():
             for p in e.further:
-                moved = free_run(self.model, whole, {**e.values, p.name: _varied(p, e.values[p.name])})
+                moved = run.readings({**e.values, p.name: _varied(p, e.values[p.name])})
                 rows.append((planned.stacked(moved) - with_[name]) / STEP)
         return Responses(np.array(rows), reach)
 
@@ -153,13 +154,13 @@ class Rows:
         Args:
             signals: with the duty (`after`).
         """
-        base, others = self._with_numbers(signals)
+        base, others = self._with_numbers(StagedRun(self.model, signals))
         return base, _unsure(base, others)
 
-    def _with_numbers(self, signals: Signals) -> tuple[Readings, list[Readings]]:
+    def _with_numbers(self, run: StagedRun) -> tuple[Readings, list[Readings]]:
         """The nominal readings, and those with each number moved by a step."""
-        return free_run(self.model, signals), [
-            free_run(self.model, signals, {n: self.model.model[n] + STEP * sd}) for n, sd in self.numbers.items()]
+        return run.readings({}), [
+            run.readings({n: self.model.model[n] + STEP * sd}) for n, sd in self.numbers.items()]
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,15 @@ import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from aeropend_ident.diagnosis.chain.free_run import StagedRun
 from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD
 from aeropend_ident.diagnosis.chain.values import clipped
 from aeropend_ident.diagnosis.document import NextExperiment
-from aeropend_ident.diagnosis.free_run_gap import free_run
 from aeropend_ident.estimation.map_fit import DAMPING, DAMPING_DOWN, finite
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import CHANNELS, Signals
@@ -219,7 +220,11 @@ class PlannedReadings:
 
     def run(self, values: Mapping[str, float]) -> dict[str, Array]:
         """Channel -> (N,) readings of a free run from rest."""
-        return free_run(self.model, self.signals, {k: v for k, v in values.items() if not key(k).is_initial})
+        return self._staged.readings({k: v for k, v in values.items() if not key(k).is_initial})
+
+    @cached_property
+    def _staged(self) -> StagedRun:
+        return StagedRun(self.model, self.signals)
 
     def readings(self, values: Mapping[str, float]) -> Array:
         """(M,) All readings in units of their noise."""

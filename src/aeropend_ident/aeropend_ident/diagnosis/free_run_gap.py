@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The gap: the difference between rig and model in a free run from the duty alone, on held-out data."""
+"""The gap: the difference between rig and model in a free run, on held-out data."""
 
 from __future__ import annotations
 
@@ -12,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
-from aeropend_ident.diagnosis.chain.values import with_values, without_effects
-from aeropend_ident.signals.pulses import mean_speed
+from aeropend_ident.diagnosis.chain.free_run import free_run
 from aeropend_ident.signals.signals import CHANNELS, FEWEST, Signals
-from aeropend_sim.model import actuator, dynamics, sensing
 from aeropend_sim.model.parameters import Model
 from aeropend_sim.readings import MOST
 
@@ -41,76 +39,6 @@ NOTHING_OPEN = 0.1
 
 Part = Literal["held out", "fitted", "whole"]
 """Part of the recordings on which a gap is measured."""
-
-
-def free_run(model: Model, signals: Signals, values: Mapping[str, float] | None = None) -> dict[str, Array]:
-    """Simulate the rig from the duty alone and read it as the rig would, without random effects.
-
-    Args:
-        model: with its effects.
-        signals: gives the duty and the instants of the pulses.
-        values: further parameters, effects, and the initial state (`initial.theta`, ...).
-
-    Returns:
-        Channel -> (N,) readings before noise and quantisation.
-    """
-    run, pieces = _run(model, signals, values or {})
-    out = {"theta": np.empty(len(signals)), "omega": _held_speed(run, signals), "i_a": np.empty(len(signals)),
-           "v_a": np.empty(len(signals))}
-    for piece, m in pieces:
-        time = signals.time[piece]
-        reading = sensing.read_angle(m, run.theta, run.theta_dot, signals.period)
-        out["theta"][piece] = reading[piece]
-        out["i_a"][piece] = sensing.read_current(m, run.i_a[piece], time)
-        out["v_a"][piece] = sensing.read_voltage(m, run.v_a[piece], time)
-    return out
-
-
-def motion(model: Model, signals: Signals, values: Mapping[str, float]) -> tuple[dynamics.Trajectory, Model]:
-    """The states of a free run (see `free_run`), and the model with these values."""
-    return _run(model, signals, values)[0], with_values(model, values)
-
-
-def _run(model: Model, signals: Signals, values: Mapping[str, float]
-         ) -> tuple[dynamics.Trajectory, list[tuple[slice, Model]]]:
-    """The states of a free run, and the pieces of the recording with the model of each."""
-    omega = values.get("initial.omega", 0.0)
-    off = without_effects(values, model)
-    pieces = [(piece, with_values(model, values if acts else off)) for piece, acts in signals.acting()]
-    n = pieces[0][1].numbers()
-    state = dynamics.State(i_a=float(actuator.current_at(n, omega)), omega=omega,
-                           theta=values.get("initial.theta", 0.0), theta_dot=values.get("initial.theta_dot", 0.0),
-                           thrust=float(actuator.thrust(n, omega)))
-    return _simulated(signals, pieces, state), pieces
-
-
-def _simulated(signals: Signals, pieces: Sequence[tuple[slice, Model]], state: dynamics.State) -> dynamics.Trajectory:
-    """The run of the whole chain, piece by piece; see `dynamics.simulate`."""
-    out = np.empty((7, len(signals)))
-    duty = np.ascontiguousarray(signals.duty, dtype=float)
-    for piece, m in pieces:
-        v, sampled = actuator.voltages(m.numbers(), duty, m.effects, signals.period, -piece.start)
-        part = np.empty((7, piece.stop - piece.start))
-        state = dynamics.run(v[piece], np.zeros(part.shape[1]), state, *dynamics.prepare(m, signals.period), part)
-        if "command_delay" in m.effects:
-            part[dynamics.ROW.v_a] += (sampled - v)[piece]
-        out[:, piece] = part
-    return dynamics.Trajectory(*out)
-
-
-def _held_speed(run: dynamics.Trajectory, signals: Signals) -> Array:
-    """[rad/s] (N,) The speed as the pulses of the recording would have timed it, held between them."""
-    p = signals.pulses
-    if p is None or not len(p.index):
-        return run.omega
-    speed = mean_speed(run.rotor_angle, p.time, p.period, signals.period)
-    last = np.searchsorted(p.index, np.arange(len(signals)), side="right") - 1
-    held = np.where(last >= 0, speed[np.maximum(last, 0)], 0.0)
-    # where the rig reads no speed, the model has stopped too if it would have shown one pulse at most
-    stopped = signals.omega == 0.0
-    back = np.maximum(np.arange(len(signals)) - round(sensing.SPEED_TIMEOUT / signals.period), 0)
-    slow = run.rotor_angle - run.rotor_angle[back] < p.period[0] * p.omega[0]
-    return np.where(stopped, np.where(slow, 0.0, run.omega), held)
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis import free_run_gap
 from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains, difference
+from aeropend_ident.diagnosis.chain.free_run import StagedRun
 from aeropend_ident.diagnosis.chain.priors import TOLERANCE, nominal_parameters, nominal_sd
 from aeropend_ident.diagnosis.chain.values import neutral
 from aeropend_ident.diagnosis.policy import CERTAIN
@@ -173,7 +173,7 @@ class JointFit:
 
     @cached_property
     def _free_run(self) -> Callable[[dict[str, float]], dict[str, Array]]:
-        return self.chains.joined(_free_run_residuals(self.chains))
+        return self.chains.joined(_free_run_residuals)
 
     def _within_tolerance(self, p: Parameter, *also: float) -> Parameter:
         """A calibrated parameter with its tolerance, and what it is also to hold, as its range."""
@@ -258,7 +258,7 @@ def _fitted(chains: CutChains, findings: Mapping[str, Findings]
     start: dict[str, float] = {}
     for f in findings.values():
         start.update(f.final.values)
-    joint = fit(chains.joined(_free_run_residuals(chains)), started(_parameters(chains, findings).values(), start))
+    joint = fit(chains.joined(_free_run_residuals), started(_parameters(chains, findings).values(), start))
     alone = _of_each_alone(chains, findings, joint)
     sd = {name: WIDER * s for name, s in joint.sd.items()}
     sd |= {name: max(sd[name], pooled_sd(estimates)) for name, estimates in alone.items()}
@@ -272,7 +272,7 @@ def _of_each_alone(chains: CutChains, findings: Mapping[str, Findings], joint: F
     alone = []
     for k in range(len(chains.each)):
         one, start = chains.only(k), chains.estimates_of(joint.values, k)
-        residuals = one.joined(_free_run_residuals(one))
+        residuals = one.joined(_free_run_residuals)
         sizes = [h.own[0].name for f in findings.values() for h in f.effects]
         starts = [start, *({**start, n: factor * start[n]} for n in sizes for factor in OTHER_SIZES)]
         fits = [fit(residuals, started(_parameters(one, findings).values(), s)) for s in starts]
@@ -290,11 +290,13 @@ def _parameters(chains: CutChains, findings: Mapping[str, Findings]) -> dict[str
     return parameters
 
 
-def _free_run_residuals(chains: CutChains) -> Callable[[CutChain, Mapping[str, float]], dict[str, Array]]:
+def _free_run_residuals(chain: CutChain) -> Callable[[Mapping[str, float]], dict[str, Array]]:
     """Residuals of all channels of a recording in a free run over its training part, in units of their noise."""
-    def residuals(chain: CutChain, values: Mapping[str, float]) -> dict[str, Array]:
-        s = chain.signals.head(chain.signals.train)
-        readings = free_run_gap.free_run(chains.model, s, values)
+    s = chain.signals.head(chain.signals.train)
+    run = StagedRun(chain.model, s)
+
+    def residuals(values: Mapping[str, float]) -> dict[str, Array]:
+        readings = run.readings(values)
         out: dict[str, Array] = {}
         for channel in ("theta", "i_a", "v_a"):
             part = slice(s.after_unseen if channel == "v_a" else 0, None)

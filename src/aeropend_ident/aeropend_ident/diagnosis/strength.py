@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis import free_run_gap
+from aeropend_ident.diagnosis.chain import free_run
 from aeropend_ident.diagnosis.chain.priors import model_parameters
 from aeropend_ident.diagnosis.chain.values import STAGES
 from aeropend_ident.diagnosis.document import Interval
@@ -57,7 +57,7 @@ class Strengths:
     def motion(self) -> tuple[dynamics.Trajectory, Model]:
         """The free run of the augmented model, and that model."""
         chains = self.joint.chains
-        return free_run_gap.motion(chains.model, self.signals, chains.values_of(self.joint.values, 0))
+        return free_run.motion(chains.model, self.signals, chains.values_of(self.joint.values, 0))
 
     def strength(self, effect: Effect, own: Mapping[str, float], numbers: Mapping[str, float]) -> float:
         """RMS of the term of an effect, in the unit of its place; of a dry friction where it moves."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis import free_run_gap
 from aeropend_ident.diagnosis.chain.chain import difference
+from aeropend_ident.diagnosis.chain.free_run import free_run
 from aeropend_ident.diagnosis.chain.priors import state_of_arm
 from aeropend_ident.diagnosis.chain.values import Values
 from aeropend_ident.diagnosis.document import ClosedGap
@@ -35,7 +36,7 @@ def validate(model: Model, augmented: Model, signals: Signals) -> ClosedGap:
     start = min(first + round(FORGOTTEN / signals.period), len(signals) // 2)
     false = signals.false_speed
     of_nominal = None if "speed_spikes" in augmented.effects else false  # that effect is part of the gap before
-    runs = [free_run_gap.free_run(m, signals, _initial_state(m, signals.head(start))) for m in (model, augmented)]
+    runs = [free_run(m, signals, _initial_state(m, signals.head(start))) for m in (model, augmented)]
     before, after = (free_run_gap.gap(run, signals, start, len(signals), leave)
                      for run, leave in zip(runs, (of_nominal, false), strict=True))
     floors = free_run_gap.floor(signals, start, len(signals))
@@ -49,7 +50,7 @@ def _initial_state(model: Model, signals: Signals) -> Values:
     read = {"initial.omega": float(speeds[0])} if len(speeds) else {}
 
     def residuals(values: Values) -> dict[str, Array]:
-        angle = free_run_gap.free_run(model, signals, {**read, **values})["theta"]
+        angle = free_run(model, signals, {**read, **values})["theta"]
         return {"theta": difference(signals.theta, angle) / signals.sigma["theta"]}
 
     return {**read, **fit(residuals, state_of_arm(model, signals)).values}

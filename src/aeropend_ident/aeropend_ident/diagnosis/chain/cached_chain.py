@@ -13,18 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
-from aeropend_ident.diagnosis.chain.values import Values
+from aeropend_ident.diagnosis.chain.values import Values, acts_on_motor
 from aeropend_ident.diagnosis.policy import UNCALIBRATED, Policy
-from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import dynamics
-from aeropend_sim.model.effects import DEFINED
 from aeropend_sim.model.parameters import Model
 
 Array = NDArray[np.float64]
-
-BEHIND_MOTOR = ("mgd_over_J", "c_over_J", "L_over_J", "initial.theta", "initial.theta_dot")
-"""Values that act behind the motor."""
 
 KEPT = 2
 """Runs of the motor that are kept (derived: one at the point of a search, one at its last trial)."""
@@ -42,18 +37,12 @@ class CachedChain(CutChain):
             self.kept = threading.local()
         runs: list[tuple[object, tuple[Array, Array, Array]]] = self.kept.__dict__.setdefault("runs", [])
         steps = dynamics.steps_in(self.valued(values), s.period)
-        wanted = (stop, steps, tuple(sorted((n, v) for n, v in values.items() if _acts_on_motor(n))))
+        wanted = (stop, steps, tuple(sorted((n, v) for n, v in values.items() if acts_on_motor(n))))
         k = next((k for k, (other, _) in enumerate(runs) if other == wanted), -1)
         run = runs.pop(k) if k >= 0 else (wanted, super().motor(values, stop))
         runs.append(run)
         del runs[:-KEPT]
         return run[1]
-
-
-def _acts_on_motor(name: str) -> bool:
-    owner = key(name).owner
-    return name not in BEHIND_MOTOR and owner != "sensing" and not (
-        owner in DEFINED and DEFINED[owner].place == "arm")
 
 
 class CachedChains(CutChains):

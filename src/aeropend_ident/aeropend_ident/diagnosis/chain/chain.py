@@ -317,14 +317,17 @@ class CutChains:
 
     def residuals(self, stage: str) -> Callable[[Values], dict[str, Array]]:
         """The residual function of a stage over all recordings."""
-        return self.joined(lambda chain, values: chain.residuals(stage)(values))
+        return self.joined(lambda chain: chain.residuals(stage))
 
-    def joined(self, of: Callable[[CutChain, Values], dict[str, Array]]) -> Callable[[Values], dict[str, Array]]:
-        """One residual function over all recordings, from one of a single recording."""
+    def joined(self, of: Callable[[CutChain], Callable[[Values], dict[str, Array]]]
+               ) -> Callable[[Values], dict[str, Array]]:
+        """One residual function over all recordings, from one of each recording."""
+        each = [of(chain) for chain in self.each]
+
         def function(values: Values) -> dict[str, Array]:
             return {key(channel).of(k): r
-                    for k, (chain, own) in enumerate(zip(self.each, self._acting(values), strict=True))
-                    for channel, r in of(chain, own).items()}
+                    for k, (residuals, own) in enumerate(zip(each, self._acting(values), strict=True))
+                    for channel, r in residuals(own).items()}
 
         return function
 

@@ -38,6 +38,9 @@ PLACE_OF_PARAMETER = {
 }
 """The place in the chain of each parameter of the model."""
 
+BEHIND_ROTOR = ("thrust", "arm", "sensing")
+"""Places in the chain that do not act back on voltage, current and speed."""
+
 PLACE_OF_CHANNEL = {"v_a": "actuator", "i_a": "electrical", "omega": "rotor", "theta": "arm"}
 """The place whose misfit a channel shows first."""
 
@@ -78,6 +81,14 @@ def neutral(model: Model, name: str) -> float:
     if k.owner == "sensing":
         return model.sensing[k.name]
     return model.effect(k.owner, k.name) if k.owner else model.model[k.name]
+
+
+def acts_on_motor(name: str) -> bool:
+    """Whether a value acts on voltage, current or speed, rather than on the arm or on a reading alone."""
+    k = key(name)
+    if k.owner in DEFINED:
+        return DEFINED[k.owner].place not in BEHIND_ROTOR
+    return k.owner != "sensing" and name not in (*STAGES["arm"], "initial.theta", "initial.theta_dot")
 
 
 def limits(name: str) -> EffectParameter | ModelParameter:

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.free_run import StagedRun
 from aeropend_ident.diagnosis.chain.priors import TOLERANCE
-from aeropend_ident.diagnosis.free_run_gap import WINDOW, HeldOut, free_run
+from aeropend_ident.diagnosis.free_run_gap import WINDOW, HeldOut
 from aeropend_ident.diagnosis.gap_share import Part, unexplained
 from aeropend_ident.estimation.parameter import Parameter, key
 
@@ -39,7 +40,8 @@ class FreeRuns:
         s = self.signals
         held_out = HeldOut(chains, self.model, [s], spikes=False).in_motion()
         self.judged = slice(s.train if held_out.part == "held out" else 0, len(s))
-        self.readings = free_run(self.model, s)
+        self._run = StagedRun(self.model, s)
+        self.readings = self._run.readings({})
         gap = held_out.gap([self.readings])
         self.spread = gap.spread
         self.rest = unexplained(gap, held_out.floors(), None, None)
@@ -62,7 +64,7 @@ class FreeRuns:
         Args:
             values: of parameters and effects.
         """
-        return self._over_spread(free_run(self.model, self.signals, values))
+        return self._over_spread(self._run.readings(values))
 
     def _weighted(self, change: Array) -> Array:
         """(M,) A change (C, N) over the fitted part; each channel counts alike."""
