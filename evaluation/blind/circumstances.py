@@ -300,6 +300,11 @@ class Judged:
         return {score.key_of(e["effect"], e["parameters"]) for e in self.label["effects"]}
 
     @property
+    def listed(self) -> bool:
+        """Whether each effect in it is claimed, or listed as small."""
+        return all(key in self.answer.found or score.id_of(key) in self.answer.small for key in self.keys)
+
+    @property
     def material(self) -> set[str]:
         """The keys of the effects in it that make `GHOST` of the gap or more."""
         return {score.key_of(e["effect"], e["parameters"]) for e in self.label["effects"]
@@ -386,6 +391,7 @@ def figures(found: Sequence[Judged]) -> list[score.Figure]:
               [j.answer.first != "none" for j in rows["nothing missing"]], at_most=0.03),
         share("three effects: all named", [j.keys <= set(j.answer.found) for j in rows["three effects"]],
               at_least=0.85),
+        share("three effects: all named, or listed as small", [j.listed for j in rows["three effects"]]),
         share("three effects: all named that make 3 % of the gap or more",
               [j.material <= set(j.answer.found) for j in rows["three effects"]]),
         share("onset: right effect first", right(rows["onset"]), at_least=0.90),

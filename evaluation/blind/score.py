@@ -92,6 +92,7 @@ class Answer:
         named: `first` and what it was said not to be separable from.
         place: of the chain, or "".
         candidates: of the diagnosis. closed: share of the gap. seconds: time taken.
+        small: ids of effects listed as found, with less than a material share of the gap.
     """
 
     first: str
@@ -101,6 +102,7 @@ class Answer:
     candidates: tuple[Candidate, ...] = ()
     closed: float | None = None
     seconds: float | None = None
+    small: tuple[str, ...] = ()
 
     @property
     def claims(self) -> bool:
@@ -139,7 +141,7 @@ def answer_of_diagnosis(body: Mapping[str, Any] | None) -> Answer:
     if first == PARAMETER_MISMATCH:
         first = mismatches[0] if mismatches else first
     return Answer(first, tuple(dict.fromkeys(found)), _named(first, which.not_separable, candidates),
-                  document.where.place, candidates, document.closure.closed, document.seconds)
+                  document.where.place, candidates, document.closure.closed, document.seconds, which.small)
 
 
 def answer_of_peer(said: Mapping[str, Any] | None) -> Answer:

@@ -125,6 +125,10 @@ def test_each_figure_of_the_circumstances_can_fail():
     three = "three effects: all named"
     assert values(judged("three effects", ["gust", "supply_sag"], {}, "gust", ["gust", "supply_sag"]))[three] == 1.0
     assert values(judged("three effects", ["gust", "supply_sag"], {}, "gust", ["gust"]))[three] == 0.0
+    both = judged("three effects", ["gust", "supply_sag"], {}, "gust", ["gust"])
+    listed = "three effects: all named, or listed as small"
+    assert values(both)[listed] == 0.0
+    assert values(replace(both, answer=replace(both.answer, small=("supply_sag",))))[listed] == 1.0
     material = "three effects: all named that make 3 % of the gap or more"
     one_small = {"gust": 0.9, "supply_sag": 0.02}
     for found, expected in (("gust", 1.0), ("supply_sag", 0.0)):
