@@ -2,6 +2,7 @@
 """The verdict goes by the parts of the gap."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -56,6 +57,57 @@ def test_what_another_effect_could_close_is_not_claimed():
     assert (head.verdict, head.effects, head.small) == ("thrust_lag", ["thrust_lag"], ["angle_offset"])
     parts = [imitates, replace(real, unique=0.01)]  # each could close what the other does
     assert headline(parts, shares(parts), 0.03).effects == ["angle_offset"]
+
+
+class Fitted:
+    """A joint fit and its gaps: squared gap by the effects that are left out, whether the others are fitted again."""
+
+    model = None
+    values = sd = {}
+
+    def __init__(self, stages, fixed, again):
+        self.findings = {f"stage {k}": SimpleNamespace(effects=effects) for k, effects in enumerate(stages)}
+        self.chains, self.fixed, self.again = SimpleNamespace(known=None), fixed, again
+        for size in (p.name for effects in stages for h in effects for p in h.own):
+            self.values, self.sd = {**self.values, size: 1.0}, {**self.sd, size: 0.1}
+
+    def without(self, effects, *, others=False):
+        names = "".join(sorted(h.name for h in effects))
+        return self.again.get(names, self.fixed.get(names)) if others else self.fixed[names]
+
+    def gap_of(self, square):
+        square = self.fixed[""] if square is self.values else square
+        return Gap({"theta": np.sqrt(square)}, {"theta": 1.0}, np.full((4, 1), square))
+
+    def floors(self):
+        return {"theta": 0.0}
+
+    def parts(self, monkeypatch):
+        monkeypatch.setattr(gap_share, "neutral", lambda model, name: 0.0)
+        return {p.name: p for p in gap_share.parts_of_effects(self, self, 0.03)}
+
+
+def effect(name):
+    return SimpleNamespace(name=name, place="arm", own=[SimpleNamespace(name=f"{name}.size")])
+
+
+def test_one_of_two_effects_that_stand_in_for_each_other_is_unique(monkeypatch):
+    a, b, c = effect("a"), effect("b"), effect("c")
+    fixed = {"": 0.1, "a": 0.5, "b": 0.7, "c": 0.2, "bc": 0.9, "ac": 0.6, "ab": 0.8, "abc": 1.0}
+    parts = Fitted([[a, b, c]], fixed, {"a": 0.11, "b": 0.12, "c": 0.2, "ab": 0.6}).parts(monkeypatch)
+    assert [parts[n].unique for n in "abc"] == pytest.approx([0.01, 0.49, 0.1])
+    head = headline(list(parts.values()), shares(list(parts.values())), 0.03)
+    assert set(head.effects) == {"b", "c"}
+    assert head.small == ["a"]
+
+
+def test_effects_that_cancel_each_other_have_the_parts_of_others_fitted_again(monkeypatch):
+    a, b, c = effect("a"), effect("b"), effect("c")
+    fixed = {"": 0.1, "a": 8.0, "b": 15.0, "c": 0.2, "bc": 9.0, "ac": 14.0, "ab": 0.9, "abc": 1.0}
+    parts = Fitted([[a, b, c]], fixed, {"a": 1.2, "b": 0.12, "c": 0.2, "bc": 0.2, "ac": 1.1}).parts(monkeypatch)
+    scale = 0.9 / (0.95 + 0.1)
+    assert [parts[n].amount for n in "abc"] == pytest.approx([scale * 0.95, -0.04, scale * 0.1])
+    assert parts["a"].ends == pytest.approx((0.8, 1.1))
 
 
 def test_false_captures_do_not_count_in_the_shares_of_others():

@@ -260,13 +260,13 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     found, joint, gaps, parts = _without_harmful(fitted, found, joint, gaps, settings, progress)
     if found.unknown is not None and not _repeats(parts, settings.material):
         found = replace(found, unknown=None)
-        parts = _parts(found, joint, gaps, settings.jobs)
+        parts = _parts(found, joint, gaps, settings)
     before = (found, joint, gaps, parts)
     if found.unknown is not None and _approximated(found.unknown, joint, gaps, parts):
         stage = found.unknown.stage
         stages = {**found.stages, stage: found.stages[stage].nothing()}
         found, joint, gaps = _fit_and_measure(fitted, replace(found, stages=stages), progress)
-        parts = _parts(found, joint, gaps, settings.jobs)
+        parts = _parts(found, joint, gaps, settings)
     if found.unknown is not None and gap_share.headline(
             parts, gap_share.shares(parts), settings.material).verdict == gap_share.UNKNOWN:
         if passed(settings.deadline):
@@ -321,18 +321,23 @@ def _without_harmful(fitted: CutChains, found: _Findings, joint: JointFit, gaps:
                      progress: Progress) -> tuple[_Findings, JointFit, _Gaps, list[Part]]:
     """Take out the effects that make the gap larger on data that no fit has used; also returns the parts of the gap.
 
-    One at a time, the most harmful first: of effects that stand in for each other, one may be needed.
+    These have a negative part, or the others leave less without them. One at a time, the most harmful first: of effects
+    that stand in for each other, one may be needed.
     """
     needed: set[str] = set()
-    parts = _parts(found, joint, gaps, settings.jobs)
-    while harmful := [p for p in parts if p.amount < 0.0 and p.name not in needed]:
-        name = min(harmful, key=lambda p: p.amount).name
+    parts = _parts(found, joint, gaps, settings)
+
+    def closes(p: Part) -> float:
+        return min(p.amount, p.unique) if p.amount >= settings.material * gap_share.whole(parts) else p.amount
+
+    while harmful := [p for p in parts if closes(p) < 0.0 and p.name not in needed]:
+        name = min(harmful, key=closes).name
         without = _fit_and_measure(fitted, _without(found, name), progress)
         if not without[2].after.total <= gaps.after.total:
             needed.add(name)  # nominal numbers could take its part over only against what is known of them
             continue
         found, joint, gaps = without
-        parts = _parts(found, joint, gaps, settings.jobs)
+        parts = _parts(found, joint, gaps, settings)
     return found, joint, gaps, parts
 
 
@@ -353,7 +358,7 @@ def _with_learned_term(fitted: CutChains, found: _Findings, joint: JointFit, gap
     if not gaps_with.after.total < gaps.after.total:
         effect_file.forget(learned.id)
         return found, joint, gaps, parts
-    return with_, joint_with, gaps_with, _parts(with_, joint_with, gaps_with, settings.jobs)
+    return with_, joint_with, gaps_with, _parts(with_, joint_with, gaps_with, settings)
 
 
 def _without(found: _Findings, name: str) -> _Findings:
@@ -494,7 +499,7 @@ def _conclude(found: _Findings, joint: JointFit, gaps: _Gaps, parts: Sequence[Pa
                     {channel: Residual(check.rms[channel], check.white[channel], check.dependence)
                      for check in joint.checks.values() for channel in check.rms},
                     tuple(reasons), None if unknown is None else _drawn(unknown.term, found.learned, joint, gaps,
-                                                                          settings.jobs),
+                                                                          settings),
                     tuple(conclude.names(a, b) for a, b in undecided),
                     conclude.next_experiment(chains.model, found.recordings[0], undecided,
                                              _unlearned(joint.values_of_rig, found.learned), tried, settings.jobs),
@@ -537,15 +542,16 @@ def _why_not_predicted(chains: CutChains, gaps: _Gaps) -> str:
             "a longer recording whose last third repeats angles and duties of the part before helps most")
 
 
-def _drawn(term: MissingTerm, learned: Learned | None, joint: JointFit, gaps: _Gaps, jobs: int) -> DrawnEffect:
+def _drawn(term: MissingTerm, learned: Learned | None, joint: JointFit, gaps: _Gaps, settings: Settings
+           ) -> DrawnEffect:
     """The unknown effect by the curves of the term that was learned; by free curves if none was."""
     if learned is None:
         return DrawnEffect(term.place, tuple(
             Curve(c.variable, c.unit, tuple(c.knot.tolist()), tuple(c.value.tolist())) for c in term.curves))
-    share = gap_share.shares(gap_share.parts_of_effects(joint, gaps.held_out.in_motion()))
+    share = gap_share.shares(gap_share.parts_of_effects(joint, gaps.held_out.in_motion(), settings.material))
     curves = tuple(Curve(f"{c.form.of}{FACTORS[c.form.factor]}", c.form.value_unit, tuple(c.knot.tolist()),
                          tuple(learned.values_of(c, joint.values))) for c in learned.curves)
-    with ThreadPoolExecutor(jobs) as pool:
+    with ThreadPoolExecutor(settings.jobs) as pool:
         fitted = fitted_formulas(gaps.held_out.chains, learned, joint.values, joint.sd, pool)
     formulas = tuple(Formula(f.id, DEFINED[f.id].term, {n: p.default for n, p in DEFINED[f.id].parameters.items()},
                              _gap_with(f.values, learned, joint, gaps)) for f in fitted)
@@ -563,10 +569,10 @@ FACTORS = {"": "", "thrust": " (share of the thrust)", "theta_dot": " (damping)"
 """What the values of a curve are that is multiplied by a quantity."""
 
 
-def _parts(found: _Findings, joint: JointFit, gaps: _Gaps, jobs: int) -> list[Part]:
+def _parts(found: _Findings, joint: JointFit, gaps: _Gaps, settings: Settings) -> list[Part]:
     """The parts of the gap: of each effect, and of what stays unexplained."""
     held_out, statistical = gaps.held_out.in_motion(), found.statistical
-    parts = gap_share.parts_of_effects(joint, held_out, jobs)
+    parts = gap_share.parts_of_effects(joint, held_out, settings.material, settings.jobs)
     unknown = None
     if found.unknown is not None:
         # of a calibrated rig the noise is known: what exceeds it is missing in the model, though it may not repeat

@@ -59,7 +59,7 @@ class Part:
         windows: (W,) the same over each window of the bootstrap.
         unsure: relative standard deviation of the size of the effect.
         ends: least and most that it may be, as effects stand in for each other.
-        unique: what comes back without it although all other effects are fitted again: no other effect closes that.
+        unique: what comes back without it although the other effects are fitted again: no other effect closes that.
     """
 
     name: str
@@ -90,7 +90,7 @@ class Headline:
     claimed: set[str]
 
 
-def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[Part]:
+def parts_of_effects(joint: JointFit, held_out: HeldOut, material: float, jobs: int = 1) -> list[Part]:
     """The part of each effect that was fitted.
 
     An effect that is taken out of all leaves a gap; one that alone is put in closes a gap. Where effects of a stage
@@ -99,9 +99,13 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
     The ends of a part are the least and the most of these two, and of what the effect alone closes without those of
     other stages too.
 
+    Effects may cancel each other, so that without one of them more is open than without all of its stage. Then their
+    sizes are hardly determined one by one, and the other effects are fitted again for both values.
+
     Args:
         joint: the joint fit.
         held_out: measures gaps.
+        material: share of the gap that is material.
         jobs: threads.
     """
     stages = [f.effects for f in joint.findings.values() if f.effects]
@@ -117,8 +121,8 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
         gaps = {frozenset(): after, **dict(zip(subsets, found, strict=True))}
         # these fits hold no prior: what an earlier verdict knows may exclude that another effect closes it
         tried = every if joint.chains.known is None else []
-        unique = dict(zip((h.name for h in tried), pool.map(
-            lambda h: squared(held_out.gap_of(joint.without([h], others=True))) - squared(after), tried), strict=True))
+        again = dict(zip((h.name for h in tried), pool.map(
+            lambda h: held_out.gap_of(joint.without([h], others=True)), tried), strict=True))
 
     def gap(effects: Sequence[Hypothesis]) -> Gap:
         return gaps[_names(effects)]
@@ -130,12 +134,48 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, jobs: int = 1) -> list[
         last, first, alone = (_coming_back(effect.name, effect.place, gap(without), gap(with_), unsure)
                               for without, with_ in (([effect], []), (effects, _but(effects, effect)),
                                                      (every, _but(every, effect))))
+        unique = math.inf
+        if effect.name in again:
+            unique = squared(again[effect.name]) - squared(after)
+            if squared(gap([effect])) > squared(gap(effects)):
+                last = alone = _coming_back(effect.name, effect.place, again[effect.name], after, unsure)
+                with_ = held_out.gap_of(joint.without(_but(effects, effect), others=True))
+                first = _coming_back(effect.name, effect.place, gap(effects), with_, unsure)
         amounts = [p.amount for p in (last, first, alone)]
         return replace(last, amount=0.5 * (last.amount + first.amount), windows=0.5 * (last.windows + first.windows),
-                       ends=(min(amounts), max(amounts)), unique=unique.get(effect.name, math.inf))
+                       ends=(min(amounts), max(amounts)), unique=unique)
 
-    return [p for effects in stages for p in _adding_up(
+    parts = [p for effects in stages for p in _adding_up(
         [part(h, effects) for h in effects], squared(gap(effects)) - squared(after))]
+    least = material * (squared(gap(every)) - after.total_floor(held_out.floors()) ** 2)
+    return _without_stand_ins(parts, {h.name: h for h in every}, joint, held_out, least)
+
+
+def _without_stand_ins(parts: Sequence[Part], effects: Mapping[str, Hypothesis], joint: JointFit, held_out: HeldOut,
+                       least: float) -> list[Part]:
+    """What is unique to each part once effects that stand in for others are left out.
+
+    Of two effects that stand in for each other neither is unique. The one without which the smaller gap is left is
+    left out, and the other is judged anew.
+
+    Args:
+        parts: of the effects.
+        effects: by name.
+        joint: the joint fit.
+        held_out: measures gaps.
+        least: amount that is material.
+    """
+    judged, left_out = {p.name: p for p in parts}, list[Hypothesis]()
+    while True:
+        open_ = [p for p in judged.values() if p.amount >= least > p.unique and effects[p.name] not in left_out]
+        if len(open_) < 2:
+            return list(judged.values())
+        left_out.append(effects[min(open_, key=lambda p: p.unique).name])
+        without = squared(held_out.gap_of(joint.without(left_out, others=True)))
+        for p in open_:
+            if effects[p.name] not in left_out:
+                one = held_out.gap_of(joint.without([*left_out, effects[p.name]], others=True))
+                judged[p.name] = replace(p, unique=squared(one) - without)
 
 
 def _names(effects: Sequence[Hypothesis]) -> frozenset[str]:
@@ -222,7 +262,7 @@ def shares(parts: Sequence[Part], *, shared: float = SHARED, ends: bool = True, 
         seed: of the bootstrap.
     """
     captures = {p.name: Interval(1.0, 1.0, 1.0) for p in parts if p.name == CAPTURES and p.amount > 0.0}
-    total = _whole(parts)
+    total = whole(parts)
     parts = [p for p in parts if p.name != CAPTURES]
     if total <= 0.0:
         return captures
@@ -249,7 +289,7 @@ def shares(parts: Sequence[Part], *, shared: float = SHARED, ends: bool = True, 
     return found
 
 
-def _whole(parts: Sequence[Part]) -> float:
+def whole(parts: Sequence[Part]) -> float:
     """The sum of the parts of the gap, without that of false captures."""
     return sum(max(p.amount, 0.0) for p in parts if p.name != CAPTURES)
 
@@ -268,7 +308,7 @@ def headline(parts: Sequence[Part], share: Mapping[str, Interval], material: flo
     scatter = shares(parts, shared=0.0, ends=False)
     likely = [p for p in named if p.name in share and share[p.name].value >= material
               and (p.name == UNKNOWN or scatter[p.name].low > 0.0)]
-    least = material * _whole(parts)
+    least = material * whole(parts)
     likely = [p for p in likely if p.name == UNKNOWN or p.unique >= least] or likely[:1]
     sure = shares(parts, ends=False) if len(likely) > 1 else {}
     claimed = [p for p in likely if p is likely[0] or p.name == UNKNOWN or sure[p.name].low >= SURELY * material]
