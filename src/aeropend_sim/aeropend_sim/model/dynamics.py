@@ -911,6 +911,8 @@ def _rates(n: Mapping[str, float], e: Values | None, added: Terms | None, period
         damping = (n["c_over_J"] + n["L_over_J"] * e.axial_inflow_k * top_speed
                    + 2.0 * math.sqrt(e.quadratic_drag_k * (top_drive + 4.0 * e.gust_sigma)))  # at terminal speed
         arm_ += [math.sqrt((n["mgd_over_J"] + abs(e.cable_torque_k)) / free) / 0.3, damping / free / 0.3]
+        if e.coulomb_friction_accel > 0.0:  # a step is cut once where the motion reverses
+            arm_.append(1.0 / LONGEST_STEP)
         if e.mast_flex_coupling > 0.0:
             arm_ += [e.mast_flex_omega / math.sqrt(free) / 0.3,
                      2.0 * e.mast_flex_zeta * e.mast_flex_omega / free / 0.3]
@@ -918,7 +920,7 @@ def _rates(n: Mapping[str, float], e: Values | None, added: Terms | None, period
         most = MOST_TERM_STEPS / period
         rate, angle, rotor_ = (min(x / 0.3, most) for x in term_rates(n, top_speed, added))
         motor.append(rotor_)
-        arm_ += [rate, angle]
+        arm_ += [rate, angle, 1.0 / LONGEST_STEP if added.arm_friction > added.rotor_friction else 0.0]
     return max(motor), max(arm_)
 
 
@@ -1097,27 +1099,17 @@ def swing(model: Model, speed: Array, state: State, period: float = SAMPLE_PERIO
     rate = max(_rates(*parts, period)[1], 1.0 / LONGEST_ARM_STEP)
     out = np.empty((2, len(speed)))
     every, done = math.floor(1.0 / (period * rate) + 1e-9), 0
-    dry = _is_dry(*parts[1:])
-    if dry:
-        rate = max(rate, 1.0 / LONGEST_STEP)
-    each = _prepared(*parts, period, min(MOST_STEPS, math.ceil(period * rate - 1e-9)))
     if every > 1:
         done = (len(speed) - 1) // every * every
-        state = run_arm(speed[:done + 1], state, every, *_prepared(*parts, every * period, 1), out[:, :done],
-                        *((each[0], each[2]) if dry else ()))
-    state = run_arm(speed[done:], state, 1, *each, out[:, done:])
+        state = run_arm(speed[:done + 1], state, every, *_prepared(*parts, every * period, 1), out[:, :done])
+    steps = min(MOST_STEPS, math.ceil(period * rate - 1e-9))
+    state = run_arm(speed[done:], state, 1, *_prepared(*parts, period, steps), out[:, done:])
     return out[0], out[1], state
-
-
-def _is_dry(e: Values | None, added: Terms | None) -> bool:
-    """Whether dry friction acts on the arm."""
-    return e is not None and (e.coulomb_friction_accel > 0.0
-                              or (added is not None and added.arm_friction > added.rotor_friction))
 
 
 @njit(nogil=True)
 def run_arm(speed: Array, state: State, every: int, c: Coefficients, e: Values | None, x: Extra | None,
-            added: Terms | None, out: Array, each_c: Coefficients | None = None, each_x: Extra | None = None) -> State:
+            added: Terms | None, out: Array) -> State:
     """Air and arm alone, for a given speed of the rotor, linear between samples.
 
     Args:
@@ -1129,42 +1121,32 @@ def run_arm(speed: Array, state: State, every: int, c: Coefficients, e: Values |
         x: coefficients of the effects; None for the nominal plant.
         added: terms by formula; None without any.
         out: (2, M), filled with θ, θ̇: at N samples, or, if `every` is greater than 1, at N - 1, a multiple of it.
-        each_c: coefficients of one sample, for where an arm with dry friction rests or reverses; None: `every` holds.
-        each_x: the same of the effects.
 
     Returns:
         The state after the last sample of `out`.
     """
-    last, end = speed.shape[0] - 1, out.shape[1]
-    k = alone = 0  # the sample, and how many from it on are advanced alone
-    while k < end:
+    last = speed.shape[0] - 1
+    for k in range(0, out.shape[1], every):
         before, w = state, speed[k]
-        one, one_x, held = c, x, every
-        if each_c is not None and (alone > 0 or state.theta_dot == 0.0 or k + every > end):
-            one, one_x, held = each_c, each_x, 1
-        rise = (speed[min(k + held, last)] - w) / one.steps
+        rise = (speed[min(k + every, last)] - w) / c.steps
         middle = 0.5 * rise
-        if held > 1:  # the middle at which a parabola has the mean of the speed
-            mean = 0.5 * (speed[k] + speed[k + held])
-            for j in range(1, held):
+        if every > 1:  # the middle at which a parabola has the mean of the speed
+            mean = 0.5 * (speed[k] + speed[k + every])
+            for j in range(1, every):
                 mean += speed[k + j]
-            middle = 0.25 * (6.0 * mean / held - speed[k + held] - 5.0 * w)
-        for _ in range(one.steps):
+            middle = 0.25 * (6.0 * mean / every - speed[k + every] - 5.0 * w)
+        for _ in range(c.steps):
             now = State(0.0, w, 0.0, state.theta, state.theta_dot, state.thrust, 0.0, state.flex, state.flex_dot, 0.0,
                         state.time, state.memory)
-            past = None if added is None else pasts(now, 0.0, one, added)
-            m, f1 = advance_arm(now, w + middle, w + rise, past, one, e, one_x, added)
+            past = None if added is None else pasts(now, 0.0, c, added)
+            m, f1 = advance_arm(now, w + middle, w + rise, past, c, e, x, added)
             w += rise
             state = State(0.0, w, 0.0, m.theta, m.theta_dot, f1, 0.0, m.flex, m.flex_dot, 0.0, now.time, now.memory)
             if added is not None and past is not None:
-                state = since(state, past_after(now, state, 0.0, past, one, added))
-        if each_c is not None and held > 1 and before.theta_dot * state.theta_dot <= 0.0:
-            state, alone = before, every
-            continue
+                state = since(state, past_after(now, state, 0.0, past, c, added))
         out[0, k], out[1, k] = before.theta, before.theta_dot
-        for j in range(1, held):
-            out[0, k + j], out[1, k + j] = between(before, state, j / held, one.h)
-        k, alone = k + held, max(alone - 1, 0)
+        for j in range(1, every):
+            out[0, k + j], out[1, k + j] = between(before, state, j / every, c.h)
     return state
 
 
