@@ -63,13 +63,12 @@ class Fitted:
     """A joint fit and its gaps: squared gap by the effects that are left out, whether the others are fitted again."""
 
     model = None
-    values = sd = {}
 
     def __init__(self, stages, fixed, again):
         self.findings = {f"stage {k}": SimpleNamespace(effects=effects) for k, effects in enumerate(stages)}
         self.chains, self.fixed, self.again = SimpleNamespace(known=None), fixed, again
-        for size in (p.name for effects in stages for h in effects for p in h.own):
-            self.values, self.sd = {**self.values, size: 1.0}, {**self.sd, size: 0.1}
+        sizes = [p.name for effects in stages for h in effects for p in h.own]
+        self.values, self.sd = dict.fromkeys(sizes, 1.0), dict.fromkeys(sizes, 0.1)
 
     def without(self, effects, *, others=False):
         names = "".join(sorted(h.name for h in effects))
