@@ -38,8 +38,8 @@ def free_run(model: Model, signals: Signals, values: Values | None = None) -> di
     """
     pieces = _pieces(model, signals, values or {})
     run = _run(signals, pieces, values or {})
-    return _read_arm(run.theta, run.theta_dot, signals, pieces) | _read_motor(
-        run.i_a, run.v_a, _held_speed(run.omega, run.rotor_angle, signals), signals, pieces)
+    held_speed = _held_speed(run.omega, run.rotor_angle, signals)
+    return _read(run.theta, run.theta_dot, run.i_a, run.v_a, held_speed, signals, pieces)
 
 
 def motion(model: Model, signals: Signals, values: Values) -> tuple[dynamics.Trajectory, Model]:
@@ -73,7 +73,7 @@ class StagedRun:
             parts = len(speed) // (piece.stop - piece.start)
             angle, rate, state = dynamics.swing(m, speed, state, s.period / parts)
             theta[piece], theta_dot[piece] = angle[::parts], rate[::parts]
-        return _read_arm(theta, theta_dot, s, pieces) | _read_motor(motor.i_a, motor.v_a, motor.held_speed, s, pieces)
+        return _read(theta, theta_dot, motor.i_a, motor.v_a, motor.held_speed, s, pieces)
 
     def _run_motor(self, values: tuple[tuple[str, float], ...]) -> _MotorRun:
         s, own = self.signals, dict(values)
@@ -134,19 +134,13 @@ def _run(signals: Signals, pieces: Pieces, values: Values) -> dynamics.Trajector
     return dynamics.Trajectory(*out)
 
 
-def _read_arm(theta: Array, theta_dot: Array, signals: Signals, pieces: Pieces) -> dict[str, Array]:
-    """The reading of the angle, from the states (N,)."""
-    out = np.empty(len(theta))
-    for piece, m in pieces:
-        out[piece] = sensing.read_angle(m, theta, theta_dot, signals.period)[piece]
-    return {"theta": out}
-
-
-def _read_motor(i_a: Array, v_a: Array, held_speed: Array, signals: Signals, pieces: Pieces) -> dict[str, Array]:
-    """The readings of speed, current and voltage, from the states (N,)."""
-    out = {"omega": held_speed, "i_a": np.empty(len(i_a)), "v_a": np.empty(len(v_a))}
+def _read(theta: Array, theta_dot: Array, i_a: Array, v_a: Array, held_speed: Array, signals: Signals, pieces: Pieces
+          ) -> dict[str, Array]:
+    """Channel -> reading, from the states (N,) and the speed (N,) as it is read."""
+    out = {"theta": np.empty(len(theta)), "omega": held_speed, "i_a": np.empty(len(i_a)), "v_a": np.empty(len(v_a))}
     for piece, m in pieces:
         time = signals.time[piece]
+        out["theta"][piece] = sensing.read_angle(m, theta, theta_dot, signals.period)[piece]
         out["i_a"][piece] = sensing.read_current(m, i_a[piece], time)
         out["v_a"][piece] = sensing.read_voltage(m, v_a[piece], time)
     return out
