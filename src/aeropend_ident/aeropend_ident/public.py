@@ -28,7 +28,7 @@ def diagnose(recordings: Recording | Sequence[Recording], model: Model | str = "
         model: the nominal model; a preset or a model file by name.
         fit_nominal: whether the rig is uncalibrated.
         held_out: share at the end of each recording that nothing is fitted to.
-        jobs: threads; the result does not depend on them.
+        jobs: processes; the result does not depend on them.
         material: share of the gap from which an effect is claimed.
         seconds: [s] that the search may take; None: a budget of simulations bounds it where it may be long.
 

@@ -70,6 +70,9 @@ class Fitted:
         sizes = [p.name for effects in stages for h in effects for p in h.own]
         self.values, self.sd = dict.fromkeys(sizes, 1.0), dict.fromkeys(sizes, 0.1)
 
+    def fit_without(self, wanted, jobs=1):
+        pass
+
     def without(self, effects, *, others=False):
         names = "".join(sorted(h.name for h in effects))
         return self.again.get(names, self.fixed.get(names)) if others else self.fixed[names]

@@ -144,7 +144,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
                         help="signals that are tried (default: as many as take about a minute on two cores)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the search; default 0")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N",
-                        help="threads (default: one a core)")
+                        help="processes (default: one a core)")
     parser.add_argument("--out", default="experiment.yaml", metavar="FILE",
                         help="file of the signal; default experiment.yaml")
     parser.add_argument("--html", metavar="FILE", help="write a page with the picture")

@@ -57,7 +57,7 @@ EXAMPLES = """examples:
   diagnose let_go --uncalibrated                 a rig without a model file; a free decay needs no command
   diagnose my_bag --effects my_effects.yaml      try effects by formula too (docs/guide/effects.md)
   diagnose my_bag --open                         show the report in the browser
-  diagnose my_bag --out verdict --jobs 2         choose the folder and the number of threads
+  diagnose my_bag --out verdict --jobs 2         choose the folder and the number of processes
   diagnose my_bag --fail-on "gap>5%" --fail-on unknown --junit verdict.xml       for a machine that decides
   plant --ros-args --params-file verdict/augmented.yaml      simulate the augmented model
 
@@ -94,7 +94,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
                         help="a further recording of the rig, on which the gap is measured but nothing is fitted; may "
                              "be given several times")
     parser.add_argument("--jobs", type=_jobs, metavar="N",
-                        help="threads, or with --each processes (default: one a core); verdicts do not depend on it")
+                        help="processes (default: one a core); verdicts do not depend on it")
     parser.add_argument("--dask", metavar="ADDRESS",
                         help="with --each: address of the scheduler of a Dask cluster whose workers diagnose")
     parser.add_argument("--fit-nominal", "--uncalibrated", action="store_true",
@@ -150,7 +150,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 def _jobs(text: str) -> int:
     if not text.isdigit() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of threads from 1 on")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of processes from 1 on")
     return int(text)
 
 

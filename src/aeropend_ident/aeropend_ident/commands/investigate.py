@@ -133,7 +133,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--tries", type=int, metavar="N",
                         help="signals that are tried for an experiment (default: as many as take about a minute)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N",
-                        help="threads (default: one a core)")
+                        help="processes (default: one a core)")
     parser.add_argument("--out", metavar="DIR", help="new folder for everything (default: investigation_<time>)")
     options = parser.parse_args(arguments)
     if options.jobs < 1:

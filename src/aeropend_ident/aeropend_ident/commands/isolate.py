@@ -124,7 +124,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
                              "be given several times")
     parser.add_argument("--no-sensors", action="store_true", help="do not try other sets of channels")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N",
-                        help="threads (default: one a core)")
+                        help="processes (default: one a core)")
     parser.add_argument("--json", action="store_true", help="print everything as JSON instead of tables")
     parser.add_argument("--html", metavar="FILE", help="write a page with the matrix of pairs")
     parser.add_argument("--overwrite", action="store_true", help="replace the file of --html")

@@ -93,7 +93,7 @@ def design(rows: Rows, goal: Goal, limits: Limits, seconds: float | None = None,
         seconds: its length; None: the shortest of `DURATIONS` with which all that is asked is reached, or the longest.
         tries: signals that are tried for one length; None: as many as `EFFORT` allows.
         seed: of the search.
-        jobs: threads.
+        jobs: processes.
         progress: of the search.
 
     Raises:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import groupby
 
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from aeropend_ident.design.goals import Answer, Goal, score
 from aeropend_ident.design.limits import Limits
 from aeropend_ident.design.responses import Rows
+from aeropend_ident.estimation.parallel import parallel
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
@@ -175,7 +175,7 @@ class Exchange:
         rows: of the rig.
         goal: of the experiment.
         limits: that hold for every rig within the uncertainty.
-        jobs: threads.
+        jobs: processes.
     """
 
     def __init__(self, rows: Rows, goal: Goal, limits: Limits, jobs: int = 1) -> None:
@@ -204,9 +204,8 @@ class Exchange:
         Args:
             starts: name -> signal, of the same length.
         """
-        with ThreadPoolExecutor(self.jobs) as pool:
-            return {name: t for name, t in zip(starts, pool.map(self.within, starts.values()), strict=True)
-                    if t is not None}
+        found = parallel(self.jobs, self.within, [*starts.values()])
+        return {name: t for name, t in zip(starts, found, strict=True) if t is not None}
 
     def improve(self, begun: Sequence[Tried], evaluations: int, seed: int, *, enough: bool = False,
                 progress: Progress = lambda _: None) -> Tried:
@@ -222,14 +221,14 @@ class Exchange:
         first = sorted(begun, key=lambda t: -t.score)[:STARTS]
         rounds = max(evaluations // (TOGETHER * len(first)), 1)
         found = []
-        with ThreadPoolExecutor(self.jobs) as pool:
-            for n, at in enumerate(first):
-                rng = np.random.default_rng([seed, n])
-                for k in range(rounds):
-                    if enough and at.enough:
-                        return at
-                    tried = pool.map(self.tried, [changed(at.holds, self.limits, rng) for _ in range(TOGETHER)])
-                    at = max([at, *(t for t in tried if t.excess <= 0.0)], key=lambda t: t.score)
-                    progress((n * rounds + k + 1) / (len(first) * rounds))
-                found.append(at)
+        for n, at in enumerate(first):
+            rng = np.random.default_rng([seed, n])
+            for k in range(rounds):
+                if enough and at.enough:
+                    return at
+                tried = parallel(self.jobs, self.tried,
+                                 [changed(at.holds, self.limits, rng) for _ in range(TOGETHER)])
+                at = max([at, *(t for t in tried if t.excess <= 0.0)], key=lambda t: t.score)
+                progress((n * rounds + k + 1) / (len(first) * rounds))
+            found.append(at)
         return max(found, key=lambda t: t.score)

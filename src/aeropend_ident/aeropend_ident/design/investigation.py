@@ -56,7 +56,7 @@ class Investigation:
         further: ids of effects of effect files.
         tries: signals that are tried for one experiment; None: the usual number.
         first: the first experiment, if it is designed already.
-        jobs: threads.
+        jobs: processes.
     """
 
     def __init__(self, model: Model, signals: Signals, limits: Limits, most: float, *, further: Sequence[str] = (),

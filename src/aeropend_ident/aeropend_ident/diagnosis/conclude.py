@@ -317,7 +317,7 @@ def next_experiment(model: Model, signals: Signals, pairs: Sequence[tuple[Ranked
         pairs: see `not_separable`.
         values: of the joint fit.
         tried: the signals that are tried.
-        jobs: threads.
+        jobs: processes.
     """
     if not pairs:
         return None

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -129,7 +128,7 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
     Args:
         model: the nominal model, with effects that are known to be there.
         recordings: one or more of one rig.
-        jobs: threads; the result does not depend on them.
+        jobs: processes; the result does not depend on them.
         progress: called as the work goes on.
         fit_nominal: whether the rig is uncalibrated: its parameters are known to a factor of three at best.
         material: share of the gap from which an effect is claimed.
@@ -168,7 +167,7 @@ class Settings:
     """What a person may set.
 
     Attributes:
-        jobs: threads.
+        jobs: processes.
         material: share of the gap from which an effect is claimed.
         deadline: [s] of `time.monotonic` after which nothing more is looked for; None: a budget of simulations bounds
             the search where it may be long.
@@ -347,8 +346,7 @@ def _with_learned_term(fitted: CutChains, found: _Findings, joint: JointFit, gap
     assert found.unknown is not None
     progress("learning the missing term", 0.92)
     unknown = found.unknown
-    with ThreadPoolExecutor(settings.jobs) as pool:
-        learned = learn(found.chains, joint.findings[unknown.stage], unknown.term.place, pool)
+    learned = learn(found.chains, joint.findings[unknown.stage], unknown.term.place, settings.jobs)
     if learned is None:
         return found, joint, gaps, parts
     stages = {**found.stages, unknown.stage: learned.findings}
@@ -551,8 +549,7 @@ def _drawn(term: MissingTerm, learned: Learned | None, joint: JointFit, gaps: _G
     share = gap_share.shares(gap_share.parts_of_effects(joint, gaps.held_out.in_motion(), settings.material))
     curves = tuple(Curve(f"{c.form.of}{FACTORS[c.form.factor]}", c.form.value_unit, tuple(c.knot.tolist()),
                          tuple(learned.values_of(c, joint.values))) for c in learned.curves)
-    with ThreadPoolExecutor(settings.jobs) as pool:
-        fitted = fitted_formulas(gaps.held_out.chains, learned, joint.values, joint.sd, pool)
+    fitted = fitted_formulas(gaps.held_out.chains, learned, joint.values, joint.sd, settings.jobs)
     formulas = tuple(Formula(f.id, DEFINED[f.id].term, {n: p.default for n, p in DEFINED[f.id].parameters.items()},
                              _gap_with(f.values, learned, joint, gaps)) for f in fitted)
     return DrawnEffect(learned.place, curves, learned.id, share.get(learned.id), formulas)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 
@@ -22,6 +21,7 @@ from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD
 from aeropend_ident.diagnosis.chain.values import clipped
 from aeropend_ident.diagnosis.document import NextExperiment
 from aeropend_ident.estimation.map_fit import DAMPING, DAMPING_DOWN, finite
+from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import CHANNELS, Signals
 from aeropend_sim.model.effects import DEFINED, PARAMETER_MISMATCH
@@ -97,11 +97,10 @@ def advise(model: Model, signals: Signals, first: Named, rivals: Sequence[Named]
         first: the hypothesis.
         rivals: at least one. An effect at its neutral size is no part of a hypothesis.
         experiments: the signals that are tried.
-        jobs: threads.
+        jobs: processes.
     """
-    with ThreadPoolExecutor(jobs) as pool:
-        found = pool.map(lambda e: distances(model, signals, first, rivals, e), experiments)
-        tried = dict(zip(experiments, found, strict=True))
+    found = parallel(jobs, lambda e: distances(model, signals, first, rivals, e), experiments)
+    tried = dict(zip(experiments, found, strict=True))
     # a difference grows with the square root of the time
     grown = {e: [d * math.sqrt(LONGEST / e.duration) for d, _ in tried[e]] for e in experiments}
     helped = [k for k in range(len(rivals)) if max(grown[e][k] for e in experiments) > SEPARATE]
@@ -134,7 +133,7 @@ def next_experiment(model: Model, signals: Signals, first: Mapping[str, float], 
         second: values of the other.
         names: of both.
         experiments: the signals that are tried.
-        jobs: threads.
+        jobs: processes.
     """
     return advise(model, signals, (names[0], first), [(names[1], second)], experiments, jobs)
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
@@ -13,6 +12,7 @@ from aeropend_ident.diagnosis.document import GapBudget
 from aeropend_ident.diagnosis.free_run_gap import NOTHING_OPEN, Gap
 from aeropend_ident.diagnosis.search import free_curves
 from aeropend_ident.diagnosis.search.free_curves import Repeatable
+from aeropend_ident.estimation.parallel import parallel
 
 
 class Repeats:
@@ -27,11 +27,10 @@ class Repeats:
         self.of_stage = cache(lambda stage: free_curves.repeatable(chains, stage, values))
 
     def of_channels(self, channels: Collection[str], jobs: int) -> dict[str, Repeatable]:
-        """The same for the stage whose misfit each channel shows first; stages are judged in threads."""
+        """The same for the stage whose misfit each channel shows first; stages are judged in processes."""
         stages = {c: next(stage for stage in STAGES if c in CHANNELS_OF[stage]) for c in channels}
         each = sorted(set(stages.values()))
-        with ThreadPoolExecutor(jobs) as pool:
-            found = dict(zip(each, pool.map(self.of_stage, each), strict=True))
+        found = dict(zip(each, parallel(jobs, self.of_stage, each), strict=True))
         return {c: found[stage] for c, stage in stages.items()}
 
 
@@ -45,7 +44,7 @@ def budget(before: Gap, after: Gap, floors: Mapping[str, float], repeats: Repeat
         floors: channel -> floor.
         repeats: how much of the rest repeats.
         gust: whether `gust` was detected: the rest of the angle is then random.
-        jobs: threads.
+        jobs: processes.
     """
     bottom = before.total_floor(floors)
     if before.total <= (1.0 + NOTHING_OPEN) * bottom:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -106,7 +105,7 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, material: float, jobs: 
         joint: the joint fit.
         held_out: measures gaps.
         material: share of the gap that is material.
-        jobs: threads.
+        jobs: processes.
     """
     stages = [f.effects for f in joint.findings.values() if f.effects]
     if not stages:
@@ -115,17 +114,15 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, material: float, jobs: 
     every = [h for effects in stages for h in effects]
     subsets = {_names(gone): gone for effects in stages for h in effects
                for gone in ([h], _but(effects, h), effects, _but(every, h), every) if gone}
-    joint.without(every)  # what all of them use, once
-    with ThreadPoolExecutor(jobs) as pool:
-        found = pool.map(lambda gone: held_out.gap_of(joint.without(gone)), subsets.values())
-        gaps = {frozenset(): after, **dict(zip(subsets, found, strict=True))}
-        # these fits hold no prior: what an earlier verdict knows may exclude that another effect closes it
-        tried = every if joint.chains.known is None else []
-        again = dict(zip((h.name for h in tried), pool.map(
-            lambda h: held_out.gap_of(joint.without([h], others=True)), tried), strict=True))
+    # these fits hold no prior: what an earlier verdict knows may exclude that another effect closes it
+    tried = every if joint.chains.known is None else []
+    joint.fit_without([*((gone, False) for gone in subsets.values()), *(([h], True) for h in tried)], jobs)
+    gaps = {frozenset(): after, **{names: held_out.gap_of(joint.without(gone)) for names, gone in subsets.items()}}
 
     def gap(effects: Sequence[Hypothesis]) -> Gap:
         return gaps[_names(effects)]
+
+    again = {h.name: held_out.gap_of(joint.without([h], others=True)) for h in tried}
 
     def part(effect: Hypothesis, effects: Sequence[Hypothesis]) -> Part:
         size = effect.own[0].name
@@ -148,11 +145,11 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, material: float, jobs: 
     parts = [p for effects in stages for p in _adding_up(
         [part(h, effects) for h in effects], squared(gap(effects)) - squared(after))]
     least = material * (squared(gap(every)) - after.total_floor(held_out.floors()) ** 2)
-    return _without_stand_ins(parts, {h.name: h for h in every}, joint, held_out, least)
+    return _without_stand_ins(parts, {h.name: h for h in every}, joint, held_out, least, jobs)
 
 
 def _without_stand_ins(parts: Sequence[Part], effects: Mapping[str, Hypothesis], joint: JointFit, held_out: HeldOut,
-                       least: float) -> list[Part]:
+                       least: float, jobs: int) -> list[Part]:
     """What is unique to each part once effects that stand in for others are left out.
 
     Of two effects that stand in for each other neither is unique. The one without which the smaller gap is left is
@@ -164,6 +161,7 @@ def _without_stand_ins(parts: Sequence[Part], effects: Mapping[str, Hypothesis],
         joint: the joint fit.
         held_out: measures gaps.
         least: amount that is material.
+        jobs: processes.
     """
     judged, left_out = {p.name: p for p in parts}, list[Hypothesis]()
     while True:
@@ -171,11 +169,12 @@ def _without_stand_ins(parts: Sequence[Part], effects: Mapping[str, Hypothesis],
         if len(open_) < 2:
             return list(judged.values())
         left_out.append(effects[min(open_, key=lambda p: p.unique).name])
+        gone = {p.name: [*left_out, effects[p.name]] for p in open_ if effects[p.name] not in left_out}
+        joint.fit_without([(left_out, True), *((each, True) for each in gone.values())], jobs)
         without = squared(held_out.gap_of(joint.without(left_out, others=True)))
-        for p in open_:
-            if effects[p.name] not in left_out:
-                one = held_out.gap_of(joint.without([*left_out, effects[p.name]], others=True))
-                judged[p.name] = replace(p, unique=squared(one) - without)
+        for name, each in gone.items():
+            one = held_out.gap_of(joint.without(each, others=True))
+            judged[name] = replace(judged[name], unique=squared(one) - without)
 
 
 def _names(effects: Sequence[Hypothesis]) -> frozenset[str]:
@@ -269,8 +268,8 @@ def shares(parts: Sequence[Part], *, shared: float = SHARED, ends: bool = True, 
     rng = np.random.default_rng(seed)
     blocks = min(len(p.windows) for p in parts)
     picks = rng.integers(0, blocks, (RESAMPLES, blocks)) if blocks > 1 else np.zeros((RESAMPLES, 1), dtype=np.intp)
-    drawn = np.array([p.windows[picks].mean(axis=1) * (1.0 + p.unsure * rng.standard_normal(RESAMPLES)) ** 2
-                      for p in parts])
+    size = [1.0 + p.unsure * rng.standard_normal(RESAMPLES) for p in parts]
+    drawn = np.array([p.windows[picks].mean(axis=1) * x**2 for p, x in zip(parts, size, strict=True)])
     drawn /= np.maximum(np.maximum(drawn, 0.0).sum(axis=0), total * LEAST_DRAWN)
     rest = np.sqrt(sum((np.maximum(d, 0.0) for p, d in zip(parts, drawn, strict=True) if p.name in ("", UNKNOWN)),
                        np.zeros(RESAMPLES)))
@@ -300,9 +299,10 @@ def headline(parts: Sequence[Part], share: Mapping[str, Interval], material: flo
     Args:
         parts: of the gap.
         share: of `shares`.
-        material: share from which a finding is claimed, if its interval is above 0, and if no other effect could close
-            as much of it: a material share must come back without it. Of effects that stand in for each other so
-            far that none does, the largest is claimed. A further effect must also surely be there.
+        material: share from which a finding is claimed, if its interval is above 0, and if no other effect could
+            close as much of it: a material share must come back without it. Of effects that
+            stand in for each other so far that none does, the largest is claimed. A further effect must also surely
+            be there.
     """
     named = sorted((p for p in parts if p.name), key=lambda p: -p.amount)
     scatter = shares(parts, shared=0.0, ends=False)

@@ -23,6 +23,7 @@ from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
 from aeropend_ident.diagnosis.search.search import refit
 from aeropend_ident.diagnosis.search.selection import noise_over_spread
 from aeropend_ident.estimation.map_fit import Fit, Sensitivities, fit, sensitivities, within_bounds
+from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.statistics import Z95, rms
 from aeropend_sim.model.parameters import Model
@@ -117,14 +118,28 @@ class JointFit:
             effects: that are taken out.
             others: whether the other effects are fitted again too; else they stay at their sizes.
         """
-        gone = {p.name for h in effects for p in h.own}
-        others = others and not self._of_effects <= gone  # without others both are the same fit
-        what = frozenset(h.name for h in effects), others
-        if what not in self._fitted_without:
-            self._fitted_without[what] = self._fit_without(gone, others=others)
-        return self._fitted_without[what]
+        self.fit_without([(effects, others)])
+        return self._fitted_without[self._named(effects, others)]
 
-    def _fit_without(self, gone: Collection[str], *, others: bool) -> dict[str, float]:
+    def fit_without(self, wanted: Sequence[tuple[Collection[Hypothesis], bool]], jobs: int = 1) -> None:
+        """Make the fits of several calls of `without`.
+
+        Args:
+            wanted: the arguments `effects` and `others` of each.
+            jobs: processes.
+        """
+        asked = {self._named(effects, others): effects for effects, others in wanted}
+        new = [(what, effects) for what, effects in asked.items() if what not in self._fitted_without]
+        _ = self._slopes  # once, for all processes
+        fits = parallel(jobs, lambda one: self._fit_without(one[1], others=one[0][1]), new)
+        self._fitted_without.update(zip([what for what, _ in new], fits, strict=True))
+
+    def _named(self, effects: Collection[Hypothesis], others: bool) -> tuple[frozenset[str], bool]:
+        some_stay = not self._of_effects <= {p.name for h in effects for p in h.own}
+        return frozenset(h.name for h in effects), others and some_stay  # without others both are the same fit
+
+    def _fit_without(self, effects: Collection[Hypothesis], *, others: bool) -> dict[str, float]:
+        gone = {p.name for h in effects for p in h.own}
         fixed = gone if others else self._of_effects
         held = {n: self.values[n] for n in fixed if n not in gone}
         free = [j for j, p in enumerate(self._bounded) if p.name not in fixed

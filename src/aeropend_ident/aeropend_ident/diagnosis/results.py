@@ -149,7 +149,7 @@ def with_would_show(document: DiagnosisDocument, diagnosis: Diagnosis, further: 
         diagnosis: the diagnosis.
         further: ids of effects of effect files.
         material: share of the gap from which an effect is claimed.
-        jobs: threads.
+        jobs: processes.
     """
     try:
         found = would_show(diagnosis.model, diagnosis.signals, further, material, jobs)

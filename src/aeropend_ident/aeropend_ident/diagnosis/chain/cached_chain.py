@@ -6,8 +6,8 @@ Most parameters of such a rig (of the arm, its initial state, its effects) leave
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Sequence
+from multiprocessing import Value
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,16 +26,14 @@ KEPT = 2
 
 
 class CachedChain(CutChain):
-    """A chain that keeps its last runs of the motor, each thread its own."""
+    """A chain that keeps its last runs of the motor."""
 
     def motor(self, values: Values, stop: int | None = None) -> tuple[Array, Array, Array]:
         """As `CutChain.motor`."""
         s = self.signals
         if s.has("v_a") or s.has("i_a") or s.has("omega"):  # the motor's input changes while the search goes on
             return super().motor(values, stop)
-        if not hasattr(self, "kept"):
-            self.kept = threading.local()
-        runs: list[tuple[object, tuple[Array, Array, Array]]] = self.kept.__dict__.setdefault("runs", [])
+        runs: list[tuple[object, tuple[Array, Array, Array]]] = vars(self).setdefault("kept", [])
         steps = dynamics.steps_in(self.valued(values), s.period)
         wanted = (stop, steps, tuple(sorted((n, v) for n, v in values.items() if acts_on_motor(n))))
         k = next((k for k, (other, _) in enumerate(runs) if other == wanted), -1)
@@ -50,8 +48,7 @@ class CachedChains(CutChains):
 
     def __init__(self, model: Model, recordings: Sequence[Signals], policy: Policy = UNCALIBRATED) -> None:
         super().__init__(model, recordings, policy)
-        self._counted = 0
-        self._lock = threading.Lock()  # fits run in threads
+        self._counted = Value("q", 0)  # shared: fits run in copies of this process
 
     def _cut(self, signals: Signals) -> CutChain:
         return CachedChain.cut(self.model, signals)
@@ -59,15 +56,15 @@ class CachedChains(CutChains):
     @property
     def runs(self) -> int:
         """Number of times that residuals were computed."""
-        return self._counted
+        return self._counted.value
 
     def residuals(self, stage: str) -> Callable[[Values], dict[str, Array]]:
         """As `CutChains.residuals`, counted."""
         function = super().residuals(stage)
 
         def counted(values: Values) -> dict[str, Array]:
-            with self._lock:
-                self._counted += 1
+            with self._counted:
+                self._counted.value += 1
             return function(values)
 
         return counted

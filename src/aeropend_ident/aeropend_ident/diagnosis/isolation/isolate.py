@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
@@ -18,6 +17,7 @@ from aeropend_ident.diagnosis.isolation.planned import like
 from aeropend_ident.diagnosis.isolation.sizes import Smallest, smallest
 from aeropend_ident.diagnosis.policy import CALIBRATED, MATERIAL_SHARE
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, hypotheses, other_forms
+from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.signals.signals import CHANNELS, Signals
 from aeropend_sim.model.effects import DEFINED, RANDOM
 from aeropend_sim.model.parameters import Model
@@ -159,13 +159,13 @@ def isolate(model: Model, recorded: Callable[[Sequence[str]], Signals], channels
         forms: whether the smallest sizes of other forms of effects are computed too.
         sensors: whether other sets of channels are tried.
         material: share of the gap from which an effect is claimed.
-        jobs: threads; the result does not depend on them.
+        jobs: processes; the result does not depend on them.
         progress: called as the work goes on.
 
     Raises:
         PlanError, RecordingError: the experiment cannot be planned.
     """
-    with threadpool_limits(1), ThreadPoolExecutor(jobs) as pool:
+    with threadpool_limits(1):
         signals = recorded(channels)
         there = tuple(c for c in CHANNELS if signals.has(c))
         progress("linearising the model", 0.0)
@@ -173,15 +173,15 @@ def isolate(model: Model, recorded: Callable[[Sequence[str]], Signals], channels
         truths = [judge.truth(h) for h in judge.hypotheses
                   if not h.parameter and (forms or not DEFINED[h.effect].form_of)]
         progress("computing the smallest sizes", 0.2)
-        _ = judge.rivals  # once, before threads share them
-        found = list(pool.map(partial(smallest, judge), truths))
+        _ = judge.rivals  # once, for all processes
+        found = parallel(jobs, partial(smallest, judge), truths)
         main = [t for t in truths if not DEFINED[t.hypothesis.effect].form_of]
         seen = {t.hypothesis.effect: s.seen for t, s in zip(truths, found, strict=True)}
         progress("telling pairs apart", 0.6)
-        at_size = list(pool.map(lambda t: _at_size(judge, t, seen[t.hypothesis.effect], sizes or {}), main))
+        at_size = parallel(jobs, lambda t: _at_size(judge, t, seen[t.hypothesis.effect], sizes or {}), main)
         progress("trying other sensors", 0.7)
         tried = [c for c in CHANNELS if c != "theta"] if sensors else []
-        others = list(pool.map(lambda c: _sensor(model, recorded, there, c, further, material, seen), tried))
+        others = parallel(jobs, lambda c: _sensor(model, recorded, there, c, further, material, seen), tried)
         progress("done", 1.0)
     return Isolation(model.name, there, len(signals) * signals.period, {c: signals.sigma[c] for c in there},
                      tuple(_shown(t, s) for t, s in zip(truths, found, strict=True)), tuple(at_size), tuple(others),
@@ -203,7 +203,7 @@ def would_show(model: Model, recordings: Sequence[Signals], further: Sequence[st
         recordings: of the rig.
         further: ids of effects of effect files.
         material: share of the gap from which an effect is claimed.
-        jobs: threads.
+        jobs: processes.
     """
     s = max(recordings, key=len)
     judge = judge_of(model, like(model, s), further, material, rivals=False)
@@ -213,8 +213,8 @@ def would_show(model: Model, recordings: Sequence[Signals], further: Sequence[st
         return WouldShow(h.effect, h.place, truth.unit, abs(truth.usual),
                          smallest(judge, truth, name=False, quickly=True).seen)
 
-    with threadpool_limits(1), ThreadPoolExecutor(jobs) as pool:
-        return tuple(pool.map(one, judge.hypotheses))
+    with threadpool_limits(1):
+        return tuple(parallel(jobs, one, judge.hypotheses))
 
 
 def _at_size(judge: Judge, truth: Truth, seen: float | None, sizes: Mapping[str, float]) -> AtSize:

@@ -6,7 +6,6 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Mapping
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +16,7 @@ from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.search.learned_term import Curve, Learned, quantity
 from aeropend_ident.diagnosis.search.proposed_formula import Proposal, definition, propose
 from aeropend_ident.estimation.map_fit import Fit, fit
+from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter, started
 from aeropend_sim.model import effect_file
 from aeropend_sim.model.effects import DEFINED
@@ -53,7 +53,7 @@ class FittedFormula:
 
 
 def fitted_formulas(chains: CutChains, learned: Learned, values: Mapping[str, float], sd: Mapping[str, float],
-                    pool: Executor) -> list[FittedFormula]:
+                    jobs: int) -> list[FittedFormula]:
     """Formulas for a learned term: those that leave least first, and of these the shortest.
 
     Args:
@@ -61,11 +61,11 @@ def fitted_formulas(chains: CutChains, learned: Learned, values: Mapping[str, fl
         learned: the term.
         values: of the joint fit, with the term.
         sd: their standard deviations.
-        pool: threads.
+        jobs: processes.
     """
     proposals = _proposals(chains, learned, values, sd)[:TRIED]
-    fitted = pool.map(lambda p: _fitted(chains, learned, p, values), proposals)
-    found = [f for f in fitted if f is not None]
+    fitted = parallel(jobs, lambda p: _fitted(chains, learned, p, values), proposals)
+    found = [_known(f, tree, learned.place) for f, tree in zip(fitted, proposals, strict=True) if f is not None]
     least = min((f.fit.mean_square for f in found), default=0.0)
 
     def rank(f: FittedFormula) -> tuple[int, float]:
@@ -136,23 +136,26 @@ def _with_memory(tree: dict[str, object], learned: Learned, values: Mapping[str,
 
 def _fitted(chains: CutChains, learned: Learned, tree: dict[str, object], values: Mapping[str, float]
             ) -> FittedFormula | None:
-    """Fit a formula in place of the learned term; None if nothing of it is left."""
+    """Fit a formula in place of the learned term, under an id that is forgotten; None if nothing of it is left."""
     id_ = _defined(tree, learned.place)
-    findings = learned.without
+    findings, effect = learned.without, DEFINED[id_]
     known = [*nominal_parameters(chains, findings.stage), *(p for h in findings.effects for p in h.own)]
-    own = [_parameter(f"{id_}.{n}", p.default, p.low, p.high) for n, p in DEFINED[id_].parameters.items()]
+    own = [_parameter(f"{id_}.{n}", p.default, p.low, p.high) for n, p in effect.parameters.items()]
     residuals = chains.residuals(findings.stage)
     found = fit(residuals, [*started(known, values), *own], least_ess=chains.policy.least_ess)
-    effect = DEFINED[id_]
-    estimates = {n: min(max(found.values[f"{id_}.{n}"], p.low), p.high) for n, p in effect.parameters.items()}
-    parameters = {n: {**old, "default": estimates[n]}
-                  for n, old in tree["parameters"].items()}  # type: ignore[attr-defined]
     effect_file.forget(id_)
-    if estimates[effect.size] == effect.parameters[effect.size].neutral:
+    size = effect.parameters[effect.size]
+    if min(max(found.values[f"{id_}.{effect.size}"], size.low), size.high) == size.neutral:
         return None
-    final = _defined({**tree, "parameters": parameters}, learned.place)
-    values = {n.replace(f"{id_}.", f"{final}."): v for n, v in found.values.items()}
-    return FittedFormula(final, values, found)
+    return FittedFormula(id_, found.values, found)
+
+
+def _known(f: FittedFormula, tree: dict[str, object], place: str) -> FittedFormula:
+    """Make a fitted formula known, with its estimates as defaults."""
+    parameters = {n: {**old, "default": min(max(f.values[f"{f.id}.{n}"], old["low"]), old["high"])}
+                  for n, old in tree["parameters"].items()}  # type: ignore[attr-defined]
+    final = _defined({**tree, "parameters": parameters}, place)
+    return FittedFormula(final, {n.replace(f"{f.id}.", f"{final}."): v for n, v in f.values.items()}, f.fit)
 
 
 def _defined(tree: dict[str, object], place: str) -> str:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +24,7 @@ from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis
 from aeropend_ident.diagnosis.search.free_curves import FOLDS, MOST_SAMPLES, knots_of
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
 from aeropend_ident.estimation.map_fit import Fit, Search, finite, fit, largest_ess
+from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_sim.model import actuator, effect_file
 from aeropend_sim.model.terms import along
@@ -197,7 +197,7 @@ class Learned:
         return [values[f"{self.id}.{name}"] for name in curve.names]
 
 
-def learn(chains: CutChains, findings: Findings, place: str, pool: Executor) -> Learned | None:
+def learn(chains: CutChains, findings: Findings, place: str, jobs: int) -> Learned | None:
     """Learn the term that a stage lacks.
 
     The first curve is fitted at each place where it predicts about as well; the evidence decides between these. Further
@@ -207,12 +207,12 @@ def learn(chains: CutChains, findings: Findings, place: str, pool: Executor) -> 
         chains: cut.
         findings: of the stage, with the effects that stay.
         place: the likeliest place so far; of places with one evidence it is taken.
-        pool: threads.
+        jobs: processes.
 
     Returns:
         The term; None if no curve predicts blocks of time that it was not fitted to.
     """
-    system = _System.of(chains, findings, (), pool)
+    system = _System.of(chains, findings, (), jobs)
     first = [_fitted(chains, findings, (system.curves[j],), values) for j, values in system.first()]
     if not first:
         return None
@@ -222,7 +222,7 @@ def learn(chains: CutChains, findings: Findings, place: str, pool: Executor) -> 
         if one is not best:
             effect_file.forget(one.id)
     while len(best.curves) < MOST_CURVES and best.fit.mean_square > GOOD_ENOUGH**2:
-        system = _System.of(chains, replace(findings, final=best.fit), best.curves, pool)
+        system = _System.of(chains, replace(findings, final=best.fit), best.curves, jobs)
         following = system.next()
         if following is None:
             break
@@ -298,14 +298,14 @@ class _System:
     count: int
 
     @classmethod
-    def of(cls, chains: CutChains, findings: Findings, there: tuple[Curve, ...], pool: Executor) -> _System:
+    def of(cls, chains: CutChains, findings: Findings, there: tuple[Curve, ...], jobs: int) -> _System:
         """The system around the final fit of a stage.
 
         Args:
             chains: cut.
             findings: of the stage.
             there: curves that the fit holds already; others at their place are tried.
-            pool: threads.
+            jobs: processes.
         """
         chains, stage, base = chains.head(MOST_SAMPLES), findings.stage, findings.final.values
         residuals = chains.residuals(stage)
@@ -324,7 +324,7 @@ class _System:
         def response(c: Curve) -> Array:
             return np.array([search.stack(x) - r for x in _raised(residuals, base, c)])
 
-        responses = list(pool.map(response, curves))
+        responses = parallel(jobs, response, curves)
         size = [max(float(np.sqrt(np.mean(b * b))), 1e-300) for b in responses]
         rows, at = [], len(jacobian)
         for c in curves:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import reduce
 from itertools import pairwise
@@ -42,6 +41,7 @@ from aeropend_ident.diagnosis.search.selection import (
 )
 from aeropend_ident.diagnosis.search.sets import compared, with_best_set
 from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess, passed
+from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter, started
 
 FOLLOWS = 0.01
@@ -96,7 +96,7 @@ def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], No
 
     Args:
         chains: cut; the input of each stage is set to what was measured, described by what was found before it.
-        jobs: threads.
+        jobs: processes.
         progress: called with the stage and the share of stages behind it.
         deadline: [s] of `time.monotonic` after which no further effect is searched; None: the budget of the policy.
         trifle: squared gap below which the rest of a stage is not searched, nor an effect accepted; see
@@ -114,21 +114,20 @@ def search(chains: CutChains, jobs: int = 1, progress: Callable[[str, float], No
     acts_on = {h.family: stages[h.name] for h in everything}
     carried: dict[str, Parameter] = {}
     bases, following = {stage: f.final for stage, f in (nominal or {}).items()}, dict(pairwise(STAGES))
-    with ThreadPoolExecutor(jobs) as pool:
-        for done, stage in enumerate(STAGES):
-            progress(stage, done / len(STAGES))
-            mine = [h for h in everything if acts_on[h.family][:1] == (stage,)]
-            f = _search_stage(chains, stage, mine, acts_on, list(carried.values()), bases, trifle, pool, deadline)
-            findings[stage] = f
-            if f.final is not bases.get(stage):  # the input of the next stage changes
-                bases.pop(following.get(stage, ""), None)
-            # an effect that acts on later stages too goes along, with the uncertainty that it has here
-            for h in f.effects:
-                if len(acts_on[h.family]) > 1:
-                    for p in h.own:
-                        carried[p.name] = Parameter(p.name, f.final.values[p.name], max(f.final.sd[p.name], 1e-12),
-                                                    p.low, p.high)
-            chains.set_next_input(stage, f.final.values)
+    for done, stage in enumerate(STAGES):
+        progress(stage, done / len(STAGES))
+        mine = [h for h in everything if acts_on[h.family][:1] == (stage,)]
+        f = _search_stage(chains, stage, mine, acts_on, list(carried.values()), bases, trifle, jobs, deadline)
+        findings[stage] = f
+        if f.final is not bases.get(stage):  # the input of the next stage changes
+            bases.pop(following.get(stage, ""), None)
+        # an effect that acts on later stages too goes along, with the uncertainty that it has here
+        for h in f.effects:
+            if len(acts_on[h.family]) > 1:
+                for p in h.own:
+                    carried[p.name] = Parameter(p.name, f.final.values[p.name], max(f.final.sd[p.name], 1e-12),
+                                                p.low, p.high)
+        chains.set_next_input(stage, f.final.values)
     return findings
 
 
@@ -154,7 +153,7 @@ def trifling_gap(chains: CutChains, nominal: Mapping[str, Findings]) -> float:
 
 def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
                   acts_on: Mapping[str, tuple[str, ...]], carried: list[Parameter], bases: Mapping[str, Fit],
-                  trifle: float, pool: ThreadPoolExecutor, deadline: float | None) -> Findings:
+                  trifle: float, jobs: int, deadline: float | None) -> Findings:
     def base_of(b: str, parameters: Sequence[Parameter]) -> Fit:
         if b in bases and not (b == stage and carried):
             return bases[b]
@@ -171,7 +170,7 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
     known, supported, gained = nominal, findings, 0.0
     in_sets = chains.policy.calibrated and chains.known is None
     while len(findings.found) < (1 if in_sets else MOST_EFFECTS):
-        here = SelectionRound(chains, stage, acts_on, downstream, known, findings.final, trifle, pool, deadline)
+        here = SelectionRound(chains, stage, acts_on, downstream, known, findings.final, trifle, jobs, deadline)
         if chains.policy.driven and _explained(here):
             break
         if here.budget_spent:
@@ -190,23 +189,23 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
     several = in_sets and not passes_as_noise(findings.final, MATERIAL)
     if not passed(deadline):
         if several:
-            findings = _with_best_set(chains, findings, nominal, candidates, pool)
+            findings = _with_best_set(chains, findings, nominal, candidates, jobs)
         else:
-            findings = _with_best_forms(chains, _with_better_rivals(chains, findings, nominal), nominal, pool)
+            findings = _with_best_forms(chains, _with_better_rivals(chains, findings, nominal), nominal, jobs)
     findings = _without_unneeded(chains, findings, nominal, trifle)
     if findings.found and several and not passed(deadline):
-        findings = compared(chains, findings, nominal, candidates, pool)
+        findings = compared(chains, findings, nominal, candidates, jobs)
     return findings
 
 
 def _with_best_set(chains: CutChains, findings: Findings, nominal: list[Parameter],
-                   candidates: Sequence[Hypothesis], pool: ThreadPoolExecutor) -> Findings:
+                   candidates: Sequence[Hypothesis], jobs: int) -> Findings:
     """The best set of effects, each in its best form beside the others; another form may lead to another set."""
     for done in range(FORMED_ANEW):
-        best = with_best_set(chains, findings, nominal, candidates, pool, contenders=not done)
+        best = with_best_set(chains, findings, nominal, candidates, jobs, contenders=not done)
         if best is findings:
             break
-        findings = _with_best_forms(chains, best, nominal, pool)
+        findings = _with_best_forms(chains, best, nominal, jobs)
         if findings.final is best.final:
             break
     return findings
@@ -303,26 +302,25 @@ def _swapped(chains: CutChains, findings: Findings, nominal: list[Parameter], k:
     return replace(findings, found=(*findings.found[:k], swapped, *findings.found[k + 1:]), final=f)
 
 
-def _with_best_forms(chains: CutChains, findings: Findings, nominal: list[Parameter], pool: ThreadPoolExecutor
-                     ) -> Findings:
+def _with_best_forms(chains: CutChains, findings: Findings, nominal: list[Parameter], jobs: int) -> Findings:
     """Choose the form of each effect again beside the others: alone, it may have stood in for one of them."""
     if len(findings.found) < 2:
         return findings
     for k, (first, *rivals) in enumerate(findings.found):
         if first.others:
-            best, *others = _forms_beside(chains, findings, _beside(findings, nominal, first.hypothesis), first, pool)
+            best, *others = _forms_beside(chains, findings, _beside(findings, nominal, first.hypothesis), first, jobs)
             found = (replace(best, others=shared(best, others)), *rivals)
             findings = replace(findings, found=(*findings.found[:k], found, *findings.found[k + 1:]), final=best.fit)
     return findings
 
 
 def _forms_beside(chains: CutChains, findings: Findings, beside: list[Parameter], first: RankedHypothesis,
-                  pool: ThreadPoolExecutor) -> list[RankedHypothesis]:
+                  jobs: int) -> list[RankedHypothesis]:
     """The forms of an effect that was found, each fitted beside the other effects; the best first."""
     def fitted(begun: Sequence[tuple[Hypothesis, Mapping[str, float]]]) -> list[tuple[Hypothesis, Fit]]:
-        fits = [pool.submit(fit, chains.residuals(findings.stage), started(adopted(beside, h), values))
-                for h, values in begun]
-        return [(h, f.result()) for (h, _), f in zip(begun, fits, strict=True)]
+        residuals = chains.residuals(findings.stage)
+        fits = parallel(jobs, lambda one: fit(residuals, started(adopted(beside, one[0]), one[1])), begun)
+        return [(h, f) for (h, _), f in zip(begun, fits, strict=True)]
 
     now = findings.final.values
     tried = [(first.hypothesis, findings.final)]

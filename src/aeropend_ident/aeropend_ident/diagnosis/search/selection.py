@@ -11,9 +11,9 @@ nominal model without its further terms), `ranked`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from aeropend_ident.diagnosis.search.hypotheses import (
     other_forms,
 )
 from aeropend_ident.estimation.map_fit import Fit, finite, fit, largest_ess, passed, screen, whittle
+from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.signals import CHANNELS
 from aeropend_ident.signals.statistics import effective_sample_size
@@ -88,6 +89,22 @@ FittedHypotheses = list[tuple[Hypothesis, Fit]]
 """Hypotheses with their fits so far."""
 
 
+class _Start(NamedTuple):
+    """A fit to be made.
+
+    Attributes:
+        hypothesis: that is fitted.
+        rounds: of the fit at most.
+        start: number of its start point.
+        begun: values to go on from instead; None: the start point.
+    """
+
+    hypothesis: Hypothesis
+    rounds: int
+    start: int = 0
+    begun: Mapping[str, float] | None = None
+
+
 @dataclass(frozen=True)
 class SelectionRound:
     """A selection round in one stage of the chain.
@@ -100,7 +117,7 @@ class SelectionRound:
         known: the parameters so far.
         current: their fit.
         trifle: squared gap that need not be closed.
-        pool: threads.
+        jobs: processes.
         deadline: [s] of `time.monotonic` after which no further effect is searched; None: the budget decides.
     """
 
@@ -111,7 +128,7 @@ class SelectionRound:
     known: list[Parameter]
     current: Fit
     trifle: float
-    pool: ThreadPoolExecutor
+    jobs: int
     deadline: float | None = None
 
     @property
@@ -125,9 +142,10 @@ class SelectionRound:
     def screened(self, candidates: list[Hypothesis]) -> FittedHypotheses:
         """The hypotheses that the linear screening leaves, each fitted for some rounds from its best start point."""
         rounds = self.chains.policy.screening_rounds
-        work = [(h, self._submit(h, rounds, start, self._better_start(h, start, linear)))
-                for h, start, linear in self._shortlist(candidates)]
-        return [(h, w.result()) for h, w in work]
+        shortlist = self._shortlist(candidates)
+        fits = self._fits([_Start(h, rounds, start, self._better_start(h, start, linear))
+                           for h, start, linear in shortlist])
+        return [(h, f) for (h, _, _), f in zip(shortlist, fits, strict=True)]
 
     def _better_start(self, h: Hypothesis, start: int, linear: Mapping[str, float]) -> Mapping[str, float] | None:
         """The values that linear algebra leads to, if a search that starts there starts better; else None."""
@@ -172,10 +190,10 @@ class SelectionRound:
         gain, lead, begun = self._likeliest(tried)[0]
         if gain + lead.log_odds <= 0.0:
             return tried, None
-        best = self._submit(lead, ROUNDS, begun=begun.values).result()
+        best = self._fit(_Start(lead, ROUNDS, begun=begun.values))
         rounds = self.chains.policy.screening_rounds
-        again = [None if h is lead else self._submit(h, rounds, begun=best.values) for h, _ in tried]
-        return better(tried, [best if one is None else one.result() for one in again]), lead
+        again = iter(self._fits([_Start(h, rounds, begun=best.values) for h, _ in tried if h is not lead]))
+        return better(tried, [best if h is lead else next(again) for h, _ in tried]), lead
 
     def converged(self, tried: FittedHypotheses, rounds: int = ROUNDS, *, but: Hypothesis | None = None
                   ) -> FittedHypotheses:
@@ -186,23 +204,20 @@ class SelectionRound:
             rounds: of the fits at most.
             but: a hypothesis that was fitted to its end already.
         """
-        likeliest = [h for _, h, _ in self._likeliest(tried)[:CONTENDERS] if h is not but]
-        work = [self._submit(h, rounds, begun=f.values) if h in likeliest else None for h, f in tried]
-        return [(h, w.result() if w else f) for (h, f), w in zip(tried, work, strict=True)]
+        likeliest = [(h, f) for _, h, f in self._likeliest(tried)[:CONTENDERS] if h is not but]
+        fits = self._fits([_Start(h, rounds, begun=f.values) for h, f in likeliest])
+        ended = {h.name: f for (h, _), f in zip(likeliest, fits, strict=True)}
+        return [(h, ended.get(h.name, f)) for h, f in tried]
 
     def multi_started(self, tried: FittedHypotheses) -> FittedHypotheses:
         """Fit the contenders from their other start points too: a search may have ended in a local minimum."""
         rounds = self.chains.policy.screening_rounds
-
-        def again(h: Hypothesis) -> list[Future[Fit]]:
-            one = len(h.starts) == 1 or DEFINED[h.effect].linear_in
-            return [] if one else [self._submit(h, rounds, start) for start in range(len(h.starts))]
-
-        likeliest = [h for _, h, _ in self._likeliest(tried)[:CONTENDERS]]
-        looks = [[w.result() for w in again(h)] if h in likeliest else [] for h, _ in tried]
-        best = [max(fits, key=lambda f: f.log_likelihood, default=None) for fits in looks]
-        work = [self._submit(h, ROUNDS, begun=b.values) if b else None for (h, _), b in zip(tried, best, strict=True)]
-        return better(tried, [w.result() if w else f for (_, f), w in zip(tried, work, strict=True)])
+        starts = [_Start(h, rounds, start) for _, h, _ in self._likeliest(tried)[:CONTENDERS]
+                  if len(h.starts) > 1 and not DEFINED[h.effect].linear_in for start in range(len(h.starts))]
+        best = _likeliest_of_each(zip([s.hypothesis for s in starts], self._fits(starts), strict=True))
+        ended = self._fits([_Start(h, ROUNDS, begun=f.values) for h, f in best])
+        again = {h.name: f for (h, _), f in zip(best, ended, strict=True)}
+        return better(tried, [again.get(h.name, f) for h, f in tried])
 
     def with_forms(self, tried: FittedHypotheses) -> FittedHypotheses:
         """The hypotheses, and other forms of the contenders; if one explains all, of those that close as much."""
@@ -210,15 +225,17 @@ class SelectionRound:
         if mean_square(likeliest[0][2], self.stage) < FORM_SHOWS:
             most = self._close_most([(h, f) for _, h, f in likeliest])
             likeliest = [one for one, closes in zip(likeliest, most, strict=True) if closes]
-        work = [[(form, [self._submit(replace(form, starts=(start,)), ROUNDS, begun=as_form(h, form, f.values))
-                         for start in form.starts]) for form in other_forms(h, self.chains)] for _, h, f in likeliest]
-        again: dict[str, Fit] = {}
-        for (_, h, f), forms in zip(likeliest, work, strict=True):
-            done = [(form, max((w.result() for w in each), key=lambda fit: fit.log_likelihood)) for form, each in forms]
-            tried = tried + done
-            form, best = max(done, key=lambda one: one[1].log_likelihood, default=(h, f))
-            if best.log_likelihood > f.log_likelihood:  # the effect itself may serve as well with these parameters
-                again[h.name] = self._submit(h, ROUNDS, begun=as_form(form, h, best.values)).result()
+        forms = [(form, _Start(replace(form, starts=(start,)), ROUNDS, begun=as_form(h, form, f.values)))
+                 for _, h, f in likeliest for form in other_forms(h, self.chains) for start in form.starts]
+        done = _likeliest_of_each(zip([form for form, _ in forms], self._fits([s for _, s in forms]), strict=True))
+        starts = []
+        for _, h, f in likeliest:  # the effect itself may serve as well with the parameters of its likeliest form
+            own = [(form, g) for form, g in done if form.family == h.family]
+            form, best = max([(h, f), *own], key=lambda one: one[1].log_likelihood)
+            if form is not h:
+                starts.append(_Start(h, ROUNDS, begun=as_form(form, h, best.values)))
+        again = {s.hypothesis.name: f for s, f in zip(starts, self._fits(starts), strict=True)}
+        tried = [*tried, *done]
         return better(tried, [again.get(h.name, f) for h, f in tried])
 
     def from_plain(self, candidates: list[Hypothesis], tried: FittedHypotheses) -> FittedHypotheses:
@@ -236,7 +253,7 @@ class SelectionRound:
         lead, best = min(here.converged(here.screened(candidates)), key=lambda item: item[1].mean_square)
         if best.mean_square > min(f.mean_square for _, f in tried):
             return tried
-        ended = self._fit(lead, ROUNDS, 0, {**absent(self.known), **best.values})
+        ended = self._fit(_Start(lead, ROUNDS, begun={**absent(self.known), **best.values}))
         return [(h, f) for h, f in tried if h.name != lead.name] + better(
             [(lead, ended)], [f for h, f in tried if h.name == lead.name] or [ended])
 
@@ -326,12 +343,12 @@ class SelectionRound:
         rest = [r for r in ranked if all(r is not c for c in close)]
         return [*sorted(again, key=lambda r: order[id(r)]), *rest]
 
-    def _submit(self, hypothesis: Hypothesis, rounds: int, start: int = 0, begun: Mapping[str, float] | None = None
-                ) -> Future[Fit]:
-        return self.pool.submit(self._fit, hypothesis, rounds, start, begun)
+    def _fits(self, starts: Sequence[_Start]) -> list[Fit]:
+        return parallel(self.jobs, self._fit, starts)
 
-    def _fit(self, hypothesis: Hypothesis, rounds: int, start: int, begun: Mapping[str, float] | None) -> Fit:
-        """Fit a hypothesis on top of what is known, on every stage that it changes; go on from `begun` if given."""
+    def _fit(self, one: _Start) -> Fit:
+        """Fit a hypothesis on top of what is known, on every stage that it changes."""
+        hypothesis, rounds, start, begun = one
         functions = [self.chains.residuals(self.stage)]
         known = started(self.known, self.current.values)
         for other in self.acts_on[hypothesis.family]:
@@ -425,6 +442,15 @@ def better(tried: FittedHypotheses, again: list[Fit]) -> FittedHypotheses:
     """Each hypothesis with the better of its two fits, by evidence."""
     ess = largest_ess([*again, *(f for _, f in tried)])
     return [(h, max(f, g, key=lambda x: x.log_evidence(ess))) for (h, f), g in zip(tried, again, strict=True)]
+
+
+def _likeliest_of_each(fits: Iterable[tuple[Hypothesis, Fit]]) -> FittedHypotheses:
+    """Each hypothesis with the likeliest of its fits."""
+    best: dict[str, tuple[Hypothesis, Fit]] = {}
+    for h, f in fits:
+        if h.name not in best or f.log_likelihood > best[h.name][1].log_likelihood:
+            best[h.name] = h, f
+    return [*best.values()]
 
 
 def squared_gap(chains: CutChains, f: Fit, channels: Collection[str] = tuple(CHANNELS)) -> float:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import NamedTuple
@@ -27,6 +26,7 @@ from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, from_linear, 
 from aeropend_ident.diagnosis.search.selection import ALIKE, CONTENDERS, ROUNDS, squared_gap
 from aeropend_ident.estimation.linear_sets import LinearSets
 from aeropend_ident.estimation.map_fit import Fit, finite, fit, prior_information, sensitivities, with_posterior_slopes
+from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter, started
 from aeropend_sim.model.effects import DEFINED
 
@@ -263,7 +263,7 @@ class LinearStage:
 
 
 def compared(chains: CutChains, findings: Findings, nominal: Sequence[Parameter], candidates: Sequence[Hypothesis],
-             pool: ThreadPoolExecutor) -> Findings:
+             jobs: int) -> Findings:
     """The findings with each effect compared with its rivals beside the others, and the sets that are likely.
 
     The closest rivals are fitted: a lag of the thrust and one of the reading, say, differ by the square of their size,
@@ -274,12 +274,12 @@ def compared(chains: CutChains, findings: Findings, nominal: Sequence[Parameter]
         findings: of a stage.
         nominal: parameters of the stage without effects.
         candidates: effects that may be members of a set.
-        pool: threads.
+        jobs: processes.
     """
     for left in reversed(range(SWAPS + 1)):
         linear = LinearStage(chains, findings, nominal, candidates)
         beside = [_beside(linear, m) for m in linear.found] if len(linear.found) > 1 else []
-        swaps = _swaps(linear, beside, pool)
+        swaps = _swaps(linear, beside, jobs)
         best = max(swaps, key=lambda s: s.gain, default=None)
         if best is None or best.gain <= LEAST or not left:
             break
@@ -338,7 +338,7 @@ def _beside(linear: LinearStage, mine: Member) -> _Beside:
     return _Beside(linear.predicted(others).log_evidence - here, rivals, [t.log_evidence - here for _, t in rivals])
 
 
-def _swaps(linear: LinearStage, beside: Sequence[_Beside], pool: ThreadPoolExecutor) -> list[_Swap]:
+def _swaps(linear: LinearStage, beside: Sequence[_Beside], jobs: int) -> list[_Swap]:
     """For each effect found its closest rivals, fitted beside the others."""
     begun = []
     for k, (mine, b) in enumerate(zip(linear.found, beside, strict=False)):
@@ -348,9 +348,15 @@ def _swaps(linear: LinearStage, beside: Sequence[_Beside], pool: ThreadPoolExecu
                 begun.append((k, m, tuple(m if x is mine else x for x in linear.found), there.values))
     if not begun:
         return []
-    now = pool.submit(linear.compared, linear.found, linear.findings.final)
-    fits = list(pool.map(lambda one: linear.compared(one[2], linear.fitted(one[2], one[3])), begun))
-    findings = replace(linear.findings, final=now.result())
+
+    def compared(one: tuple[int, Member, Set, dict[str, float]] | None) -> Fit:
+        if one is None:
+            return linear.compared(linear.found, linear.findings.final)
+        _, _, members, values = one
+        return linear.compared(members, linear.fitted(members, values))
+
+    now, *fits = parallel(jobs, compared, [None, *begun])
+    findings = replace(linear.findings, final=now)
     return [_Swap(k, m, _gain(findings, [x.hypothesis for x in members], f), f)
             for (k, m, members, _), f in zip(begun, fits, strict=True)]
 
@@ -406,7 +412,7 @@ def names(members: Set) -> frozenset[str]:
 
 
 def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Parameter],
-                  candidates: Sequence[Hypothesis], pool: ThreadPoolExecutor, *, contenders: bool = True) -> Findings:
+                  candidates: Sequence[Hypothesis], jobs: int, *, contenders: bool = True) -> Findings:
     """The findings of a stage with the set of effects that has most log evidence.
 
     The search starts from what was found, and from each contender of the first round alone that closes about as much: a
@@ -417,7 +423,7 @@ def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Param
         findings: what was found so far.
         nominal: parameters of the stage without effects.
         candidates: effects that may be members of a set.
-        pool: threads.
+        jobs: processes.
         contenders: whether to start from each contender of the first round too.
     """
     found = {h.name for h in findings.effects}
@@ -428,12 +434,14 @@ def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Param
              if {r.hypothesis.name} != found and x <= ALIKE * min(left)]
     seen: set[frozenset[str]] = set()
     best = _climbed(chains, findings, nominal, candidates, seen)
-    climbs = [pool.submit(_climbed, chains, replace(findings, found=((r,),), final=r.fit), nominal, candidates, {*seen})
-              for r in alone if contenders]
-    for climb in climbs:
-        there = climb.result()
-        if _gain(best.findings, there.findings.effects, there.findings.final) > LEAST:
-            best = there
+
+    def climbed(r: RankedHypothesis) -> Findings:
+        start = replace(findings, found=((r,),), final=r.fit)
+        return _climbed(chains, start, nominal, candidates, {*seen}).findings
+
+    for there in parallel(jobs, climbed, alone if contenders else []):
+        if _gain(best.findings, there.effects, there.final) > LEAST:
+            best = LinearStage(chains, there, nominal, candidates)
     if best.findings is findings:
         return findings
     return replace(best.findings, rivals=findings.rivals, found=tuple(

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calls spread over processes that are copies of this one.
+
+The fits of a search share one recording. Threads gain little: array operations pass the interpreter's lock around. A
+copy of the process (fork) holds the recording and all that is known already; only results are sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from typing import Any, TypeVar
+
+from aeropend_sim.errors import UserError
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+_work: list[tuple[Callable[[Any], Any], Sequence[Any]]] = []
+"""The function and what it is called with, in a copy; empty in the process that is copied."""
+
+
+def parallel(jobs: int, function: Callable[[T], R], items: Sequence[T]) -> list[R]:
+    """The results of a function for each item, in their order.
+
+    A function that changes anything changes it in a copy alone. A call from within a copy is not spread further.
+
+    Args:
+        jobs: processes at once; 1: this one.
+        function: of an item.
+        items: of any kind; only results are sent between processes.
+
+    Raises:
+        UserError: the system ended a process.
+    """
+    if min(jobs, len(items)) < 2 or _work:
+        return [function(item) for item in items]
+    try:
+        with ProcessPoolExecutor(min(jobs, len(items)), get_context("fork"), _begin, (function, items)) as pool:
+            return list(pool.map(_result, range(len(items))))
+    except BrokenProcessPool:
+        raise UserError("the system ended a process of the search, probably for want of memory: try --jobs 1") from None
+
+
+def _begin(function: Callable[[Any], Any], items: Sequence[Any]) -> None:
+    _work.append((function, items))
+
+
+def _result(k: int) -> Any:
+    (function, items), = _work
+    return function(items[k])

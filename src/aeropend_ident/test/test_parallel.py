@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calls in copies of a process: the results of one process, its errors, and a line if a copy is ended."""
+
+import os
+import signal
+
+import pytest
+
+from aeropend_ident.estimation.parallel import parallel
+from aeropend_sim.errors import UserError
+
+
+@pytest.mark.parametrize("jobs", [1, 2, 5])
+def test_results_come_in_order_and_functions_need_not_be_sent(jobs):
+    factor = [10]
+    assert parallel(jobs, lambda x: factor[0] * x, range(7)) == [0, 10, 20, 30, 40, 50, 60]
+
+
+def test_several_processes_work_and_a_copy_makes_no_further_ones():
+    def of_process(_):
+        return os.getpid(), parallel(4, lambda _: os.getpid(), range(4))
+
+    found = parallel(2, of_process, range(6))
+    assert os.getpid() not in {mine for mine, _ in found}
+    assert all(set(inner) == {mine} for mine, inner in found)
+    assert parallel(1, lambda _: os.getpid(), range(3)) == [os.getpid()] * 3
+
+
+def test_what_a_function_changes_stays_in_its_copy():
+    seen = []
+    parallel(2, seen.append, range(4))
+    assert seen == []
+
+
+def test_an_error_is_the_callers():
+    def fails(x):
+        raise ValueError(f"item {x}")
+
+    with pytest.raises(ValueError, match="item 0"):
+        parallel(2, fails, range(3))
+
+
+def test_a_copy_that_the_system_ends_is_said_in_one_line():
+    with pytest.raises(UserError, match="want of memory: try --jobs 1"):
+        parallel(2, lambda _: os.kill(os.getpid(), signal.SIGKILL), range(2))
