@@ -69,6 +69,7 @@ class Fitted:
         self.chains, self.fixed, self.again = SimpleNamespace(known=None), fixed, again
         sizes = [p.name for effects in stages for h in effects for p in h.own]
         self.values, self.sd = dict.fromkeys(sizes, 1.0), dict.fromkeys(sizes, 0.1)
+        self.before = 2.0
 
     def fit_without(self, wanted, jobs=1):
         pass
@@ -86,7 +87,7 @@ class Fitted:
 
     def parts(self, monkeypatch):
         monkeypatch.setattr(gap_share, "neutral", lambda model, name: 0.0)
-        return {p.name: p for p in gap_share.parts_of_effects(self, self, 0.03)}
+        return {p.name: p for p in gap_share.parts_of_effects(self, self, self.gap_of(self.before), 0.03)}
 
 
 def effect(name):
@@ -110,6 +111,20 @@ def test_effects_that_cancel_each_other_have_the_parts_of_others_fitted_again(mo
     scale = 0.9 / (0.95 + 0.1)
     assert [parts[n].amount for n in "abc"] == pytest.approx([scale * 0.95, -0.04, scale * 0.1])
     assert parts["a"].ends == pytest.approx((0.8, 1.1))
+
+
+def test_an_effect_closes_no_more_than_the_nominal_model_leaves(monkeypatch):
+    fitted = Fitted([[effect("a")]], {"": 0.1, "a": 0.5}, {})
+    assert fitted.parts(monkeypatch)["a"].amount == pytest.approx(0.4)
+    fitted.before = 0.09
+    assert fitted.parts(monkeypatch)["a"].amount == pytest.approx(-0.01)
+    assert fitted.parts(monkeypatch)["a"].unique == pytest.approx(-0.01)
+
+
+def test_an_effect_whose_size_may_be_nothing_is_no_claim():
+    for unsure, effects in ((0.4, ["cable_torque"]), (0.6, [])):
+        parts = [part("cable_torque", 1.0, unsure=unsure), part("", 0.1)]
+        assert headline(parts, shares(parts), 0.03).effects == effects
 
 
 def test_false_captures_do_not_count_in_the_shares_of_others():

@@ -89,7 +89,7 @@ class Headline:
     claimed: set[str]
 
 
-def parts_of_effects(joint: JointFit, held_out: HeldOut, material: float, jobs: int = 1) -> list[Part]:
+def parts_of_effects(joint: JointFit, held_out: HeldOut, before: Gap, material: float, jobs: int = 1) -> list[Part]:
     """The part of each effect that was fitted.
 
     An effect that is taken out of all leaves a gap; one that alone is put in closes a gap. Where effects of a stage
@@ -101,9 +101,12 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, material: float, jobs: 
     Effects may cancel each other, so that without one of them more is open than without all of its stage. Then their
     sizes are hardly determined one by one, and the other effects are fitted again for both values.
 
+    The nominal model is one without effects. So without all of them no more is open than it leaves.
+
     Args:
         joint: the joint fit.
         held_out: measures gaps.
+        before: gap of the nominal model, measured likewise.
         material: share of the gap that is material.
         jobs: processes.
     """
@@ -122,7 +125,8 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, material: float, jobs: 
     def gap(effects: Sequence[Hypothesis]) -> Gap:
         return gaps[_names(effects)]
 
-    again = {h.name: held_out.gap_of(joint.without([h], others=True)) for h in tried}
+    gaps[_names(every)] = min(gaps[_names(every)], before, key=squared)
+    again = {h.name: gap(every) if len(every) == 1 else held_out.gap_of(joint.without([h], others=True)) for h in tried}
 
     def part(effect: Hypothesis, effects: Sequence[Hypothesis]) -> Part:
         size = effect.own[0].name
@@ -268,7 +272,8 @@ def shares(parts: Sequence[Part], *, shared: float = SHARED, ends: bool = True, 
     rng = np.random.default_rng(seed)
     blocks = min(len(p.windows) for p in parts)
     picks = rng.integers(0, blocks, (RESAMPLES, blocks)) if blocks > 1 else np.zeros((RESAMPLES, 1), dtype=np.intp)
-    size = [1.0 + p.unsure * rng.standard_normal(RESAMPLES) for p in parts]
+    # a size of the other sign closes nothing
+    size = [np.maximum(1.0 + p.unsure * rng.standard_normal(RESAMPLES), 0.0) for p in parts]
     drawn = np.array([p.windows[picks].mean(axis=1) * x**2 for p, x in zip(parts, size, strict=True)])
     drawn /= np.maximum(np.maximum(drawn, 0.0).sum(axis=0), total * LEAST_DRAWN)
     rest = np.sqrt(sum((np.maximum(d, 0.0) for p, d in zip(parts, drawn, strict=True) if p.name in ("", UNKNOWN)),
@@ -299,8 +304,8 @@ def headline(parts: Sequence[Part], share: Mapping[str, Interval], material: flo
     Args:
         parts: of the gap.
         share: of `shares`.
-        material: share from which a finding is claimed, if its interval is above 0, and if no other effect could
-            close as much of it: a material share must come back without it. Of effects that
+        material: share from which a finding is claimed, if the intervals of the share and of the size exclude 0, and if
+            no other effect could close as much of it: a material share must come back without it. Of effects that
             stand in for each other so far that none does, the largest is claimed. A further effect must also surely
             be there.
     """
