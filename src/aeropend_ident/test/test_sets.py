@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sets of effects: the log evidence of a linear model, and effects that stood in for others."""
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -56,12 +55,6 @@ def test_a_column_that_is_fixed_is_added_as_it_is():
 
 
 @pytest.fixture(scope="module")
-def pool():
-    with ThreadPoolExecutor(2) as made:
-        yield made
-
-
-@pytest.fixture(scope="module")
 def chains():
     """A rig whose thrust lags, and whose arm has drag."""
     effects = {"thrust_lag": {"tau": 0.04}, "quadratic_drag": {"k": 0.3}}
@@ -91,23 +84,23 @@ def test_the_linear_model_predicts_the_fit_of_a_set(chains):
     assert there.values["quadratic_drag.k"] == pytest.approx(0.3, rel=0.2)
 
 
-def test_effects_that_stand_in_for_others_give_way_to_them(chains, pool):
+def test_effects_that_stand_in_for_others_give_way_to_them(chains):
     findings, nominal, candidates = found_alone(chains, "encoder_lag", "axial_inflow")
-    best = with_best_set(chains, findings, nominal, candidates, pool)
+    best = with_best_set(chains, findings, nominal, candidates, 2)
     assert {h.name for h in best.effects} == {"thrust_lag", "quadratic_drag"}
     assert best.final.values["thrust_lag.tau"] == pytest.approx(0.04, rel=0.1)
     assert all(selection[0].probability > 0.9 for selection in best.found)
     assert all(r.probability < 0.1 for selection in best.found for r in selection[1:])
 
 
-def test_the_right_set_stays_as_it_is(chains, pool):
+def test_the_right_set_stays_as_it_is(chains):
     findings, nominal, candidates = found_alone(chains, "thrust_lag", "quadratic_drag")
-    assert with_best_set(chains, findings, nominal, candidates, pool) is findings
+    assert with_best_set(chains, findings, nominal, candidates, 2) is findings
 
 
-def test_the_sets_that_are_likely_are_those_whose_fits_are(chains, pool):
+def test_the_sets_that_are_likely_are_those_whose_fits_are(chains):
     findings, nominal, candidates = found_alone(chains, "thrust_lag", "quadratic_drag")
-    first, *others = compared(chains, findings, nominal, candidates, pool).sets
+    first, *others = compared(chains, findings, nominal, candidates, 2).sets
     assert set(first.effects) == {"thrust_lag", "quadratic_drag"}
     assert first.probability + sum(s.probability for s in others) <= 1.0
     assert [s.probability for s in others] == sorted((s.probability for s in others), reverse=True)
@@ -121,12 +114,12 @@ def test_an_effect_that_closes_less_than_a_trifle_is_taken_out(chains):
     assert len(_without_unneeded(chains, findings, nominal, 1.0).effects) == 1
 
 
-def test_a_search_that_starts_from_the_wrong_lag_ends_at_the_right_one(chains, pool):
+def test_a_search_that_starts_from_the_wrong_lag_ends_at_the_right_one(chains):
     """No small step leads from one to the other, but a contender of the first round is a start too."""
     wrong, nominal, candidates = found_alone(chains, "encoder_lag", "quadratic_drag")
     right, *_ = found_alone(chains, "thrust_lag")
     findings = replace(wrong, found=((wrong.found[0][0], right.found[0][0]), wrong.found[1]))
-    best = with_best_set(chains, findings, nominal, candidates, pool)
+    best = with_best_set(chains, findings, nominal, candidates, 2)
     assert {h.name for h in best.effects} == {"thrust_lag", "quadratic_drag"}
 
 
@@ -140,11 +133,11 @@ def sticking(tau, seed):
 
 @pytest.mark.promise("Verdict", "Each effect of several is compared with its rivals beside the others")
 @pytest.mark.parametrize(("tau", "told_apart"), [(0.008, False), (0.03, True)])
-def test_a_rival_is_fitted_beside_the_other_effects(tau, told_apart, pool):
+def test_a_rival_is_fitted_beside_the_other_effects(tau, told_apart):
     """A short lag of the thrust is like one of the encoder, a long one is not."""
     chains = sticking(tau, 4)
     findings, nominal, candidates = found_alone(chains, "coulomb_friction", "encoder_lag")
-    found = compared(chains, findings, nominal, candidates, pool)
+    found = compared(chains, findings, nominal, candidates, 2)
     lag = next(s for s in found.found if s[0].hypothesis.place != "arm")
     probability = {r.hypothesis.name: r.probability for r in lag}
     assert (probability["encoder_lag"] < 0.05) == told_apart
