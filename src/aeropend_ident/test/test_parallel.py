@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calls in copies of a process: the results of one process, its errors, and a line if a copy is ended."""
+"""Calls in copies of a process: the results of one process, its errors, a line if a copy is ended, and Ctrl-C."""
 
 import os
 import signal
 
 import pytest
 
+from aeropend_ident.estimation.interrupt import between_simulations, check
 from aeropend_ident.estimation.parallel import parallel
 from aeropend_sim.errors import UserError
 
@@ -43,3 +44,26 @@ def test_an_error_is_the_callers():
 def test_a_copy_that_the_system_ends_is_said_in_one_line():
     with pytest.raises(UserError, match="want of memory: try --jobs 1"):
         parallel(2, lambda _: os.kill(os.getpid(), signal.SIGKILL), range(2))
+
+
+def interrupted(after=lambda: None):
+    with between_simulations():
+        signal.raise_signal(signal.SIGINT)
+        after()
+
+
+def test_ctrl_c_takes_effect_at_the_next_check_or_at_the_end():
+    done = []
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(lambda: [done.append("what had begun"), check(), done.append("more")])
+    assert done == ["what had begun"]
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    check()
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+def test_ctrl_c_ends_the_copies_too():
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(lambda: parallel(2, lambda _: os.kill(os.getpid(), signal.SIGINT), range(2)))

@@ -7,12 +7,14 @@ copy of the process (fork) holds the recording and all that is known already; on
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from typing import Any, TypeVar
 
+from aeropend_ident.estimation.interrupt import check
 from aeropend_sim.errors import UserError
 
 T = TypeVar("T")
@@ -41,10 +43,12 @@ def parallel(jobs: int, function: Callable[[T], R], items: Sequence[T]) -> list[
         with ProcessPoolExecutor(min(jobs, len(items)), get_context("fork"), _begin, (function, items)) as pool:
             return list(pool.map(_result, range(len(items))))
     except BrokenProcessPool:
+        check()  # Ctrl-C ends the copies too
         raise UserError("the system ended a process of the search, probably for want of memory: try --jobs 1") from None
 
 
 def _begin(function: Callable[[Any], Any], items: Sequence[Any]) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     _work.append((function, items))
 
 

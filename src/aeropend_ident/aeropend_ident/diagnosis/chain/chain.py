@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from aeropend_ident.diagnosis.chain.known import Known
 from aeropend_ident.diagnosis.chain.values import STAGES, Values, with_values, without_effects
 from aeropend_ident.diagnosis.policy import CALIBRATED, Policy
+from aeropend_ident.estimation.interrupt import check
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.pulses import mean_speed
 from aeropend_ident.signals.signals import Signals, split_apply
@@ -325,6 +326,7 @@ class CutChains:
         each = [of(chain) for chain in self.each]
 
         def function(values: Values) -> dict[str, Array]:
+            check()
             return {key(channel).of(k): r
                     for k, (residuals, own) in enumerate(zip(each, self._acting(values), strict=True))
                     for channel, r in residuals(own).items()}
