@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 import shutil
-import signal
 import tempfile
-import threading
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from aeropend_ident.interrupt import interrupts_wait
 from aeropend_sim.errors import UserError
 from aeropend_sim.model.parameters import ModelError
 
@@ -114,7 +113,7 @@ def atomic_folder(out: Path, files: Sequence[str]) -> Iterator[Path]:
             out.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=out, prefix=".writing_") as place:
                 yield Path(place)
-                afterwards.enter_context(_interrupts_wait())
+                afterwards.enter_context(interrupts_wait())
                 for name in files:
                     (Path(place) / name).replace(out / name)
         except BaseException as error:  # Ctrl-C too
@@ -125,26 +124,3 @@ def atomic_folder(out: Path, files: Sequence[str]) -> Iterator[Path]:
             why = error.strerror if isinstance(error, OSError) else error
             raise OutputError(f"{out}: the results cannot be written: {why}; give another folder with --out or make "
                               "room") from None
-
-
-@contextmanager
-def on_interrupt(handler: Callable[[int, object], object] | signal.Handlers) -> Iterator[None]:
-    """Handle Ctrl-C by this handler. Only the main thread is interrupted; in other threads nothing changes."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
-def _interrupts_wait() -> Iterator[None]:
-    """Ctrl-C in this block takes effect at its end."""
-    came = []
-    with on_interrupt(lambda *_: came.append(True)):
-        yield
-    if came:
-        signal.raise_signal(signal.SIGINT)

@@ -11,7 +11,7 @@ ROOT = Path(aeropend_ident.__file__).parent
 PACKAGE = "aeropend_ident"
 
 LAYERS = [
-    ["result_folder", "bags"],
+    ["interrupt", "result_folder", "bags"],
     ["signals"],
     ["estimation"],
     ["identification", "diagnosis.policy", "diagnosis.typed_json", "diagnosis.document",

@@ -6,8 +6,8 @@ import signal
 
 import pytest
 
-from aeropend_ident.estimation.interrupt import between_simulations, check
 from aeropend_ident.estimation.parallel import parallel
+from aeropend_ident.interrupt import check, interrupts_wait, on_interrupt
 from aeropend_sim.errors import UserError
 
 
@@ -47,7 +47,7 @@ def test_a_copy_that_the_system_ends_is_said_in_one_line():
 
 
 def interrupted(after=lambda: None):
-    with between_simulations():
+    with interrupts_wait():
         signal.raise_signal(signal.SIGINT)
         after()
 
@@ -62,6 +62,12 @@ def test_ctrl_c_takes_effect_at_the_next_check_or_at_the_end():
     check()
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)
+
+
+def test_where_ctrl_c_is_ignored_it_stays_so():
+    with on_interrupt(signal.SIG_IGN):
+        interrupted(check)
+        assert parallel(2, lambda _: os.kill(os.getpid(), signal.SIGINT), range(2)) == [None, None]
 
 
 def test_ctrl_c_ends_the_copies_too():

@@ -30,7 +30,7 @@ from aeropend_ident.diagnosis.document import read as read_document
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.diagnosis.results import FILES, Results, document, with_would_show
 from aeropend_ident.diagnosis.validation import validate
-from aeropend_ident.estimation.interrupt import between_simulations
+from aeropend_ident.interrupt import interrupts_wait
 from aeropend_ident.result_folder import ensure_free, folder_names
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import Mounting
@@ -204,7 +204,7 @@ def run(options: argparse.Namespace, command: str, rules: Sequence[checks.Rule])
         if of_rig is not None:
             signals = [(of_rig.mounting or Mounting()).of(s) for s in signals]
         signals = [replace(s, variant=variants.get(bag, SAME)) for bag, s in zip(options.bags, signals, strict=True)]
-        with between_simulations():
+        with interrupts_wait():
             found = diagnose(model, signals, options.jobs, fit_nominal=options.fit_nominal, material=options.material,
                              seconds=options.seconds, known=known, further=further,
                              progress=lambda what, share: show(share, what))

@@ -23,7 +23,8 @@ from aeropend_ident.diagnosis import dask_cluster
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
 from aeropend_ident.diagnosis.results import Results, document
-from aeropend_ident.result_folder import OutputError, on_interrupt
+from aeropend_ident.interrupt import on_interrupt
+from aeropend_ident.result_folder import OutputError
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import effect_file

@@ -14,7 +14,7 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from typing import Any, TypeVar
 
-from aeropend_ident.estimation.interrupt import check
+from aeropend_ident.interrupt import check
 from aeropend_sim.errors import UserError
 
 T = TypeVar("T")
@@ -48,7 +48,8 @@ def parallel(jobs: int, function: Callable[[T], R], items: Sequence[T]) -> list[
 
 
 def _begin(function: Callable[[Any], Any], items: Sequence[Any]) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     _work.append((function, items))
 
 
