@@ -349,13 +349,11 @@ def _swaps(linear: LinearStage, beside: Sequence[_Beside], jobs: int) -> list[_S
     if not begun:
         return []
 
-    def compared(one: tuple[int, Member, Set, dict[str, float]] | None) -> Fit:
-        if one is None:
-            return linear.compared(linear.found, linear.findings.final)
-        _, _, members, values = one
-        return linear.compared(members, linear.fitted(members, values))
+    def compared(one: tuple[Set, Mapping[str, float] | None]) -> Fit:
+        members, start = one
+        return linear.compared(members, linear.findings.final if start is None else linear.fitted(members, start))
 
-    now, *fits = parallel(jobs, compared, [None, *begun])
+    now, *fits = parallel(jobs, compared, [(linear.found, None), *((members, start) for _, _, members, start in begun)])
     findings = replace(linear.findings, final=now)
     return [_Swap(k, m, _gain(findings, [x.hypothesis for x in members], f), f)
             for (k, m, members, _), f in zip(begun, fits, strict=True)]
@@ -439,11 +437,14 @@ def with_best_set(chains: CutChains, findings: Findings, nominal: Sequence[Param
         start = replace(findings, found=((r,),), final=r.fit)
         return _climbed(chains, start, nominal, candidates, {*seen}).findings
 
+    lead = best.findings
     for there in parallel(jobs, climbed, alone if contenders else []):
-        if _gain(best.findings, there.effects, there.final) > LEAST:
-            best = LinearStage(chains, there, nominal, candidates)
-    if best.findings is findings:
+        if _gain(lead, there.effects, there.final) > LEAST:
+            lead = there
+    if lead is findings:
         return findings
+    if lead is not best.findings:
+        best = LinearStage(chains, lead, nominal, candidates)
     return replace(best.findings, rivals=findings.rivals, found=tuple(
         s if m.hypothesis.name in found else _anew(best, m, findings)
         for m, s in zip(best.found, best.findings.found, strict=True)))
