@@ -546,8 +546,7 @@ def _drawn(term: MissingTerm, learned: Learned | None, joint: JointFit, gaps: _G
     if learned is None:
         return DrawnEffect(term.place, tuple(
             Curve(c.variable, c.unit, tuple(c.knot.tolist()), tuple(c.value.tolist())) for c in term.curves))
-    moving = gaps.held_out.in_motion()
-    share = gap_share.shares(gap_share.parts_of_effects(joint, moving, moving.gap(gaps.runs_before), settings.material))
+    share = gap_share.shares(_parts_of_effects(joint, gaps, settings))
     curves = tuple(Curve(f"{c.form.of}{FACTORS[c.form.factor]}", c.form.value_unit, tuple(c.knot.tolist()),
                          tuple(learned.values_of(c, joint.values))) for c in learned.curves)
     fitted = fitted_formulas(gaps.held_out.chains, learned, joint.values, joint.sd, settings.jobs)
@@ -570,8 +569,7 @@ FACTORS = {"": "", "thrust": " (share of the thrust)", "theta_dot": " (damping)"
 def _parts(found: _Findings, joint: JointFit, gaps: _Gaps, settings: Settings) -> list[Part]:
     """The parts of the gap: of each effect, and of what stays unexplained."""
     held_out, statistical = gaps.held_out.in_motion(), found.statistical
-    before = held_out.gap(gaps.runs_before)
-    parts = gap_share.parts_of_effects(joint, held_out, before, settings.material, settings.jobs)
+    parts = _parts_of_effects(joint, gaps, settings)
     unknown = None
     if found.unknown is not None:
         # of a calibrated rig the noise is known: what exceeds it is missing in the model, though it may not repeat
@@ -588,6 +586,12 @@ def _parts(found: _Findings, joint: JointFit, gaps: _Gaps, settings: Settings) -
         parts.append(gap_share.part_of_spikes(statistical.spikes, whole.gap(gaps.runs_before, known=False),
                                               whole.gap(gaps.runs_before)))
     return parts
+
+
+def _parts_of_effects(joint: JointFit, gaps: _Gaps, settings: Settings) -> list[Part]:
+    """The part of each effect, measured where the arm moves."""
+    moving = gaps.held_out.in_motion()
+    return gap_share.parts_of_effects(joint, moving, moving.gap(gaps.runs_before), settings.material, settings.jobs)
 
 
 def _parts_of_parameters(joint: JointFit, gaps: _Gaps) -> list[Part]:
