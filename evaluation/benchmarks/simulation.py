@@ -205,9 +205,9 @@ model = load("bench")
 full = model.with_effects({i: {n: p.default for n, p in e.parameters.items()} for i, e in CATALOGUE.items()})
 for one in (model, full):
     rig.record(one, duty)
-    prepared = dynamics.prepare(one)
-    dynamics.run_arm(duty, dynamics.State(), *prepared, np.empty((2, 10)))
-    dynamics.run_motor(duty, dynamics.State(), *prepared, np.empty((3, 10)))
+    prepared = prepare(one)
+    dynamics.run_arm(duty, State(), *prepared, np.empty((2, 10)))
+    dynamics.run_motor(duty, State(), *prepared, np.empty((3, 10)))
 ensemble.squared_errors([model], duty, np.zeros((4, 10)))
 print(imported - start, time.process_time() - imported)
 """

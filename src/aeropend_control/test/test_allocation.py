@@ -5,9 +5,11 @@ import pytest
 from aeropend_control.laws.allocation import Allocation
 from aeropend_control.laws.observer import Observer
 from aeropend_sim.model import actuator, dynamics
+from aeropend_sim.model.coefficients import prepare
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import Model, load
 from aeropend_sim.model.rig import Rig
+from aeropend_sim.model.state import State
 
 BENCH = load("bench")
 MOTOR = ["bridge_drop", "supply_sag", "brush_drop", "rotor_friction", "thrust_exponent"]
@@ -22,7 +24,7 @@ def with_effect(effect):
 @pytest.mark.parametrize("thrust", [0.05, 0.2])
 def test_the_rig_gives_the_thrust_that_is_asked_for(effect, thrust):
     model = with_effect(effect)
-    duty, given = Allocation(Observer(model)).duty(thrust, dynamics.State(omega=100.0, thrust=thrust))
+    duty, given = Allocation(Observer(model)).duty(thrust, State(omega=100.0, thrust=thrust))
     truth = Rig(Model("held", BENCH.model, BENCH.sensing, model.effects)).run(np.full(6000, duty))[1]
     assert given == pytest.approx(thrust)
     assert truth[6, -1] == pytest.approx(thrust, rel=0.01)
@@ -31,7 +33,7 @@ def test_the_rig_gives_the_thrust_that_is_asked_for(effect, thrust):
 @pytest.mark.parametrize("thrust_time", [0.0, 0.05])
 def test_what_the_limits_leave_is_told(thrust_time):
     allocation = Allocation(Observer(BENCH), thrust_time)
-    at_rest = dynamics.State()
+    at_rest = State()
     duty, given = allocation.duty(2.0, at_rest)
     assert duty == 1.0
     assert 0.0 < given < 1.0
@@ -41,7 +43,7 @@ def test_what_the_limits_leave_is_told(thrust_time):
 def test_a_thrust_time_is_the_time_in_which_the_thrust_follows():
     observer = Observer(BENCH)
     allocation, model = Allocation(observer, 0.08), BENCH
-    prepared = dynamics.prepare(model)
+    prepared = prepare(model)
     state = dynamics.steady(model, 0.4)
     start, out, thrust = state.thrust, np.empty((7, 1)), []
     for _ in range(300):

@@ -18,7 +18,9 @@ from aeropend_ident.diagnosis.results import document as document_of
 from aeropend_ident.signals.from_bag import from_uncalibrated
 from aeropend_ident.testing.rigs import BENCH, recorded
 from aeropend_sim.model import dynamics
+from aeropend_sim.model.coefficients import prepare
 from aeropend_sim.model.parameters import Model
+from aeropend_sim.model.state import State
 
 
 def free_decay(first, rate=20.0, every=5):
@@ -26,7 +28,7 @@ def free_decay(first, rate=20.0, every=5):
     model = Model("arm", {**BENCH.model, "mgd_over_J": 40.0, "c_over_J": 0.4}, BENCH.sensing, {})
     n = round(8.0 * rate) * every + 1
     out = np.empty((2, n))
-    dynamics.run_arm(np.zeros(n), dynamics.State(theta=first), 1, *dynamics.prepare(model, 1.0 / rate / every), out)
+    dynamics.run_arm(np.zeros(n), State(theta=first), 1, *prepare(model, 1.0 / rate / every), out)
     theta = out[0, ::every] + 1e-3 * np.random.default_rng(1).standard_normal(n // every + 1)
     stamps = np.rint(np.arange(len(theta)) * 1e9 / rate).astype(np.int64)
     nothing, no_time = np.full(len(theta), np.nan), np.empty(0, np.int64)

@@ -21,8 +21,10 @@ from aeropend_ident.estimation.map_fit import fit
 from aeropend_ident.signals.signals import from_arrays
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import rig
-from aeropend_sim.model.dynamics import State, prepare, run_arm, run_motor
+from aeropend_sim.model.coefficients import prepare
+from aeropend_sim.model.dynamics import run_arm, run_motor
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
+from aeropend_sim.model.state import State
 
 
 def bent_current(columns, truth):

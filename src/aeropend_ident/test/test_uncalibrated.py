@@ -31,8 +31,10 @@ from aeropend_ident.signals.statistics import effective_sample_size
 from aeropend_ident.testing import bags
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import dynamics, rig
+from aeropend_sim.model.coefficients import prepare
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
+from aeropend_sim.model.state import State
 
 DEGREE = math.radians(1.0)
 
@@ -44,7 +46,7 @@ def let_go(seconds, effects=None, gravity=40.0, damping=0.4, first=1.0, rate=20.
     every = 5
     n = round((seconds - held) * rate) * every + 1
     out = np.empty((2, n))
-    dynamics.run_arm(np.zeros(n), dynamics.State(theta=first), 1, *dynamics.prepare(model, 1.0 / rate / every), out)
+    dynamics.run_arm(np.zeros(n), State(theta=first), 1, *prepare(model, 1.0 / rate / every), out)
     theta = np.concatenate([np.full(round(held * rate), first), out[0, ::every]]) + zero
     theta = theta + 0.2 * lsb * np.random.default_rng(seed).standard_normal(len(theta))
     return np.arange(len(theta)) / rate, np.round(theta / lsb) * lsb if lsb else theta

@@ -58,6 +58,10 @@ def njit(cached: bool = True, **options: Any) -> Callable[[F], F]:
     return decorate
 
 
+equation = njit(forceinline=True, error_model="numpy")
+"""Decorator of an equation: it is compiled into its callers, without a test for zero before each division."""
+
+
 @cache
 def source_hash(module: str) -> str:
     """Hash of a module's source and of the sources of all modules of these packages that it imports at its top.

@@ -9,9 +9,12 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from aeropend_sim.model import actuator, dynamics
-from aeropend_sim.model.dynamics import simulate, steady, steps_in
+from aeropend_sim.model.arm import linear_arm
+from aeropend_sim.model.coefficients import MOST_STEPS, prepare, steps_in
+from aeropend_sim.model.dynamics import simulate, steady
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
+from aeropend_sim.model.state import State
 
 PERIODS = [5e-4, SAMPLE_PERIOD, 5e-3, 20e-3, 50e-3]
 EQUATIONS = [id_ for id_, effect in CATALOGUE.items() if effect.place != "sensing"]
@@ -289,7 +292,7 @@ def test_small_torque_never_moves_an_arm_that_sticks():
 def test_free_swing_ends_stuck_within_the_band_of_friction():
     accel = 2.0
     model = load("bench").with_effects({"coulomb_friction": {"accel": accel}})
-    found = simulate(model, np.zeros(5000), state=dynamics.State(theta=1.0))
+    found = simulate(model, np.zeros(5000), state=State(theta=1.0))
     end = found.theta[-1]
     assert 0.0 < abs(end) <= np.arcsin(accel / model.model["mgd_over_J"])
     still = found.theta == end
@@ -363,18 +366,18 @@ def test_long_holds_and_fast_plants_are_cut():
     fast = base.with_effects({"mast_flex": {"coupling": 0.9, "omega": 300.0, "zeta": 1.0}})
     assert steps_in(fast, SAMPLE_PERIOD) > 10
     absurd = Model("absurd", {**base.model, "J_m": 1e-9, "L_a": 1e-7, "K_t": 10.0, "K_e": 10.0}, base.sensing)
-    assert steps_in(absurd, 1.0) == dynamics.MOST_STEPS
+    assert steps_in(absurd, 1.0) == MOST_STEPS
 
 
 @pytest.mark.parametrize("period", [SAMPLE_PERIOD, 20e-3])
 def test_motor_alone_and_arm_alone_are_the_parts_of_the_whole(period):
     model, duty = load("bench").with_effects(defaults("brush_drop", "winding_heating", "thrust_lag")), duty_for(period)
     whole = simulate(model, duty, period)
-    prepared = dynamics.prepare(model, period)
+    prepared = prepare(model, period)
     motor, arm = np.empty((3, len(duty))), np.empty((2, len(duty)))
-    dynamics.run_motor(whole.v_a, dynamics.State(), *prepared, motor)
+    dynamics.run_motor(whole.v_a, State(), *prepared, motor)
     assert np.array_equal(motor, [whole.i_a, whole.omega, whole.rotor_angle])
-    dynamics.run_arm(whole.omega, dynamics.State(), 1, *prepared, arm)
+    dynamics.run_arm(whole.omega, State(), 1, *prepared, arm)
     coarse = 30.0 * (period / 0.02)**2  # the speed is a straight line between samples
     assert np.abs(arm[0] - whole.theta).max() < 1e-3 * coarse * np.ptp(whole.theta)
 
@@ -383,10 +386,10 @@ def test_motor_alone_and_arm_alone_are_the_parts_of_the_whole(period):
                                      ("coulomb_friction", "quadratic_drag")])
 def test_an_arm_that_takes_longer_steps_swings_the_same(effects):
     model, duty = load("bench").with_effects(defaults(*effects)), duty_for(SAMPLE_PERIOD)
-    speed, state = simulate(model, duty).omega, dynamics.State(theta=0.2, theta_dot=-0.5)
+    speed, state = simulate(model, duty).omega, State(theta=0.2, theta_dot=-0.5)
     theta, rate, after = dynamics.swing(model, speed, state)
     each = np.empty((2, len(duty)))
-    exact = dynamics.run_arm(speed, state, 1, *dynamics.prepare(model), each)
+    exact = dynamics.run_arm(speed, state, 1, *prepare(model), each)
     assert np.abs(theta - each[0]).max() < 1e-5 * np.ptp(theta)
     assert np.abs(rate - each[1]).max() < 1e-4 * np.ptp(rate)
     assert after.theta == pytest.approx(exact.theta, abs=1e-5)
@@ -398,4 +401,4 @@ def test_the_transition_of_the_linear_arm_is_exact_to_second_order(h):
     rates = np.array([[0.0, 1.0, 0.0], [-stiffness, -damping, 1.0], [0.0, 0.0, 0.0]])
     exact = expm(rates * h)[:2]
     missing = (np.linalg.norm(rates, 2) * h)**3 / 6.0
-    assert np.reshape(dynamics.linear_arm(stiffness, damping, h), (2, 3)) == pytest.approx(exact, abs=missing)
+    assert np.reshape(linear_arm(stiffness, damping, h), (2, 3)) == pytest.approx(exact, abs=missing)

@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 
 from aeropend_sim.model import ensemble
-from aeropend_sim.model.dynamics import Coefficients, Lag, simulate, steady
+from aeropend_sim.model.coefficients import Coefficients
+from aeropend_sim.model.dynamics import simulate, steady
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.ensemble import ROW, squared_errors
+from aeropend_sim.model.lag import Lag
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
 
 

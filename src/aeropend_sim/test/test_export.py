@@ -19,6 +19,7 @@ from aeropend_sim.model import dynamics, effect_file
 from aeropend_sim.model.effects import CATALOGUE, DEFINED
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load, save
 from aeropend_sim.model.rig import Rig
+from aeropend_sim.model.state import State
 
 STEPS_AS_OURS = pytest.mark.promise(
     "Other simulators",
@@ -68,7 +69,7 @@ class Ours:
     def __init__(self, model: Model, duty: np.ndarray) -> None:
         smooth = dict.fromkeys(model.sensing, 0.0) | {"angle_filter_tau": model.sensing["angle_filter_tau"]}
         rig = Rig(Model(model.name, model.model, smooth, model.effects))
-        rig._state = dynamics.State()
+        rig._state = State()
         self.noise = np.random.default_rng(1).standard_normal(len(duty))
         rig._kicks = types.SimpleNamespace(standard_normal=lambda _: self.noise)
         read, truth = rig.run(duty)
@@ -183,7 +184,7 @@ def test_the_fmu_keeps_states_and_refuses_what_it_has_not(tmp_path):
 def test_a_start_angle_is_that_of_a_rig_let_go():
     rig = module(targets.python_module(BENCH)).Model(theta=0.5)
     out = np.array([rig.step(0.0) for _ in range(200)])
-    free = dynamics.simulate(BENCH, np.zeros(200), state=dynamics.State(theta=0.5))
+    free = dynamics.simulate(BENCH, np.zeros(200), state=State(theta=0.5))
     assert np.allclose(out[:, 0], free.theta, atol=1e-12)
     assert out[0, 6] == 0.5
 

@@ -18,6 +18,7 @@ from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.forms import FORMS
 from aeropend_sim.model.parameters import Model, load
 from aeropend_sim.model.rig import record
+from aeropend_sim.model.state import State
 
 BENCH = load("bench")
 DUTY = Excitation(duration=12.0).series()
@@ -66,7 +67,7 @@ def test_dry_friction_holds_the_arm_in_mujoco(tmp_path, monkeypatch):
     """The reason for `solimpfriction`, and for `MULTIPLE`: with MuJoCo's own values the arm creeps back by 0.02 rad."""
     model = with_effects("coulomb_friction")
     found = in_mujoco(model, tmp_path, monkeypatch, np.zeros(5000), theta=0.3)
-    ours = dynamics.simulate(model, np.zeros(5000), state=dynamics.State(theta=0.3))
+    ours = dynamics.simulate(model, np.zeros(5000), state=State(theta=0.3))
     assert abs(ours.theta[-1]) > 1e-3
     assert found["theta"][-1] == pytest.approx(ours.theta[-1], abs=1e-4)
     assert abs(found["theta"][-1] - found["theta"][-1500]) < 1e-5
@@ -80,7 +81,7 @@ def test_the_arm_alone_is_a_pendulum_of_the_models_frequency_and_damping():
     for _ in range(4 * 1000):
         theta.append(float(data.qpos[0]))
         mujoco.mj_step(compiled, data)
-    free = dynamics.simulate(BENCH, np.zeros(1000), state=dynamics.State(theta=0.8))
+    free = dynamics.simulate(BENCH, np.zeros(1000), state=State(theta=0.8))
     assert np.allclose(theta[::4], free.theta, atol=2e-3)
 
 

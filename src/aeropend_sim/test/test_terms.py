@@ -7,10 +7,12 @@ from scipy.integrate import solve_ivp
 
 from aeropend_sim.errors import UserError
 from aeropend_sim.model import actuator, dynamics, effect_file, sensing
+from aeropend_sim.model.coefficients import prepare
 from aeropend_sim.model.dynamics import simulate
 from aeropend_sim.model.effects import DEFINED
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, load
 from aeropend_sim.model.rig import record
+from aeropend_sim.model.state import State
 from aeropend_sim.model.terms import along, series, terms
 
 BENCH = load("bench")
@@ -98,7 +100,7 @@ def test_the_true_voltage_is_that_of_an_error_which_depends_on_the_time():
 @pytest.mark.parametrize("id_", ["bending_friction", "relaxing_hose", "rising"])
 def test_the_simulation_agrees_with_an_integrator_of_scipy(id_):
     model, n = with_(id_), BENCH.numbers()
-    start = dynamics.State(theta=1.0)
+    start = State(theta=1.0)
     found = simulate(model, np.zeros(1500), state=start)
     p = model.effects[id_]
 
@@ -116,10 +118,10 @@ def test_the_simulation_agrees_with_an_integrator_of_scipy(id_):
 
 def test_a_run_in_parts_is_the_whole_run():
     model = with_("relaxing_hose", "rising", "as_sag")
-    prepared = dynamics.prepare(model)
+    prepared = prepare(model)
     v = actuator.acting_voltage(model.numbers(), DUTY, model.effects, SAMPLE_PERIOD)
-    whole, parts, state = np.empty((7, len(v))), np.empty((7, len(v))), dynamics.State()
-    dynamics.run(v, np.zeros(len(v)), dynamics.State(), *prepared, whole)
+    whole, parts, state = np.empty((7, len(v))), np.empty((7, len(v))), State()
+    dynamics.run(v, np.zeros(len(v)), State(), *prepared, whole)
     for part in (slice(0, 777), slice(777, 778), slice(778, len(v))):
         out = np.empty((7, part.stop - part.start))
         state = dynamics.run(v[part], np.zeros(out.shape[1]), state, *prepared, out)
@@ -129,10 +131,10 @@ def test_a_run_in_parts_is_the_whole_run():
 
 def test_the_stages_of_the_chain_alone_agree_with_the_whole():
     model = with_("as_drag", "as_inflow", "as_load", "as_resistance")
-    whole, prepared = simulate(model, DUTY), dynamics.prepare(model)
+    whole, prepared = simulate(model, DUTY), prepare(model)
     motor, arm = np.empty((3, len(DUTY))), np.empty((2, len(DUTY)))
-    dynamics.run_motor(whole.v_a, dynamics.State(), *prepared, motor)
-    dynamics.run_arm(whole.omega, dynamics.State(), 1, *prepared, arm)
+    dynamics.run_motor(whole.v_a, State(), *prepared, motor)
+    dynamics.run_arm(whole.omega, State(), 1, *prepared, arm)
     assert motor[1] == pytest.approx(whole.omega, abs=1e-9)
     assert arm[0] == pytest.approx(whole.theta, abs=2e-4)
 

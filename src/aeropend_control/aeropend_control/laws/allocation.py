@@ -12,7 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_control.laws.observer import Observer
-from aeropend_sim.model import actuator, dynamics
+from aeropend_sim.model import actuator
+from aeropend_sim.model.arm import static_thrust
+from aeropend_sim.model.effects import THRUST_PIVOT_SPEED
+from aeropend_sim.model.motor import brush_sign
+from aeropend_sim.model.state import State
 
 Array = NDArray[np.float64]
 
@@ -44,7 +48,7 @@ class Allocation:
         self._thrust_lag = model.effect("thrust_lag", "tau")
         self._thrust_exponent = model.effect("thrust_exponent", "n")
 
-    def duty(self, thrust: float, s: dynamics.State) -> tuple[float, float]:
+    def duty(self, thrust: float, s: State) -> tuple[float, float]:
         """Duty for a demanded thrust.
 
         Args:
@@ -73,29 +77,29 @@ class Allocation:
         """[s] The share of `thrust_time` [s] that is the air's; 0 if the model has no `thrust_lag`."""
         return min(self._thrust_lag, 0.5 * thrust_time)
 
-    def static_thrust_for(self, thrust: float, s: dynamics.State, air_time: float) -> float:
+    def static_thrust_for(self, thrust: float, s: State, air_time: float) -> float:
         """[N] Static thrust for which the lagging thrust follows a demand [N] with the time constant `air_time` [s]."""
         return s.thrust + self._thrust_lag / air_time * (thrust - s.thrust) if air_time else thrust
 
-    def thrust_from(self, thrust: float, s: dynamics.State, air_time: float) -> float:
+    def thrust_from(self, thrust: float, s: State, air_time: float) -> float:
         """[N] Thrust that a static thrust [N] amounts to: the inverse of `static_thrust_for`."""
         return s.thrust + air_time / self._thrust_lag * (thrust - s.thrust) if air_time else thrust
 
     def thrust(self, speed: float) -> float:
         """[N] Thrust at a steady speed [rad/s]."""
         c, e, *_ = self._observer.plant
-        return float(dynamics.static_thrust(speed, c, e))
+        return float(static_thrust(speed, c, e))
 
     def speed(self, thrust: float) -> float:
         """[rad/s] Speed for a steady thrust [N]; 0 for a negative one, which the propeller cannot give."""
-        pivot, exponent = dynamics.THRUST_PIVOT_SPEED, self._thrust_exponent
+        pivot, exponent = THRUST_PIVOT_SPEED, self._thrust_exponent
         if thrust <= 0.0:
             return 0.0
         if exponent == 2.0:
             return float(actuator.speed(self._numbers, thrust))
         return pivot * (thrust / (self._numbers["k_thrust"] * pivot**2)) ** (1.0 / exponent)
 
-    def resistance(self, s: dynamics.State) -> float:
+    def resistance(self, s: State) -> float:
         """[Ω] Resistance of winding and supply."""
         return self._numbers["R_a"] * (1.0 + self._heating * s.heat) + self._supply_resistance
 
@@ -104,9 +108,9 @@ class Allocation:
         friction = self._rotor_friction / self._numbers["K_t"] if wanted > 0.0 else 0.0
         return float(actuator.current_at(self._numbers, speed)) + friction
 
-    def drop(self, current: float, s: dynamics.State) -> float:
+    def drop(self, current: float, s: State) -> float:
         """[V] Voltage drop of a steady current [A] in winding, brushes and supply."""
-        brushes = self._brush_drop * float(dynamics.brush_sign(current)) if self._brush_drop else 0.0
+        brushes = self._brush_drop * float(brush_sign(current)) if self._brush_drop else 0.0
         return self.resistance(s) * current + brushes
 
     def duty_of_voltage(self, wanted: float) -> tuple[float, float]:

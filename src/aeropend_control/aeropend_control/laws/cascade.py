@@ -22,9 +22,9 @@ from aeropend_control.laws.observer import Estimate, Observer
 from aeropend_control.laws.pid import PID
 from aeropend_control.laws.reference_model import DAMPING, ReferenceModel
 from aeropend_control.laws.tuning import OPERATING_POINT, TABLE_6_1, TIME_SHARE, Requirements, place, thrust_lag
-from aeropend_sim.model import dynamics
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 from aeropend_sim.model.rig import Sample
+from aeropend_sim.model.state import State
 
 GAINS = {
     "speed_kp": Gain("A·s/rad", 0.0, 100.0, None, "proportional gain from speed to current"),
@@ -88,7 +88,7 @@ class SpeedLoop:
         self._speed.reset()
         self._current.reset()
 
-    def align(self, reference: float, s: dynamics.State) -> None:
+    def align(self, reference: float, s: State) -> None:
         """Set the integrals so that the loop continues without a bump from the steady voltage of a state.
 
         Args:
@@ -100,7 +100,7 @@ class SpeedLoop:
         self._speed.align(free * held, reference, s.omega)
         self._current.align(free * (self._numbers["K_e"] * s.omega + self._allocation.drop(held, s)), held, held)
 
-    def duty(self, reference: float, s: dynamics.State) -> tuple[float, float]:
+    def duty(self, reference: float, s: State) -> tuple[float, float]:
         """Duty for a demanded speed; call it once a sample.
 
         Args:
@@ -259,7 +259,7 @@ class FeedbackLinearizationCascade(FeedbackLinearization):
         late = follow * (jerk + c * acceleration + g * math.cos(y) * rate)  # compensates the lag of the thrust
         return y, acceleration + c * rate + late + self.gains["kd"] * rate
 
-    def _drive(self, thrust: float, s: dynamics.State) -> tuple[float, float]:
+    def _drive(self, thrust: float, s: State) -> tuple[float, float]:
         assert self._loop is not None
         a = self._allocation
         air_time = a.air_time(self.gains["thrust_time"])

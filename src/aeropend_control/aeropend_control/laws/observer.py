@@ -13,8 +13,11 @@ from scipy.linalg import expm, solve_discrete_are
 
 from aeropend_sim.compiled import njit
 from aeropend_sim.model import actuator, dynamics, sensing
+from aeropend_sim.model.arm import arm_drive, arm_terms, near_ground
+from aeropend_sim.model.coefficients import Coefficients, Extra, prepare
 from aeropend_sim.model.effects import Values
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+from aeropend_sim.model.state import Motion, Past, State
 from aeropend_sim.model.terms import Terms
 
 Array = NDArray[np.float64]
@@ -48,14 +51,14 @@ class Estimate(NamedTuple):
 
     Attributes:
         state: SI units.
-        drive: [rad/s²] `dynamics.arm_drive` without thrust. It does not include dry friction, the estimate of the
+        drive: [rad/s²] `arm_drive` without thrust. It does not include dry friction, the estimate of the
             unknown torque, and the bending of the mast. (In slow motion the mast is practically rigid; in fast motion
             the thrust is too late to compensate it.)
         nominal_drive: [rad/s²] the same without effects.
         ground: share by which the ground effect increases the thrust.
     """
 
-    state: dynamics.State
+    state: State
     drive: float
     nominal_drive: float
     ground: float
@@ -106,7 +109,7 @@ class Observer:
         self.model, self.period, self.motor = model, period, motor
         self.numbers = model.numbers()
         steady = {"gust": {"sigma": 1e-9, "tau": 1e3}}  # no random torque, only a state for the estimate
-        c, e, x, added = dynamics.prepare(model.with_effects({**model.effects, **steady}), period)
+        c, e, x, added = prepare(model.with_effects({**model.effects, **steady}), period)
         assert e is not None
         assert x is not None
         self.plant = c, e, x, added
@@ -134,7 +137,7 @@ class Observer:
         self._motor = MotorCorrection()
         self._angles = np.zeros(HISTORY)
         self._queue = deque([self._voltage(duty)] * self._whole)
-        self.state: dynamics.State | None = None if math.isnan(theta) else self._start(theta)
+        self.state: State | None = None if math.isnan(theta) else self._start(theta)
 
     @property
     def voltage_bias(self) -> float:
@@ -173,7 +176,7 @@ class Observer:
                                                       *self.plant)
         return Estimate(*estimate)
 
-    def _start(self, theta: float) -> dynamics.State:
+    def _start(self, theta: float) -> State:
         angle = 0.0 if math.isnan(theta) else theta
         for _ in range(8):  # fixed-point iteration: the encoder's error depends slightly on the angle
             self._memory = sensing.start(angle, 0.0, 0.0, 0.0, self._chain)
@@ -188,14 +191,14 @@ class Observer:
 
 
 @njit(nogil=True)
-def _observe(theta: float, volts: Array, s: dynamics.State, m: sensing.Memory, gain: Array,
-             chain: sensing.MeasurementChain, c: dynamics.Coefficients, e: Values | None, x: dynamics.Extra | None,
-             added: Terms | None) -> tuple[dynamics.State, sensing.Memory, tuple[dynamics.State, float, float, float]]:
+def _observe(theta: float, volts: Array, s: State, m: sensing.Memory, gain: Array,
+             chain: sensing.MeasurementChain, c: Coefficients, e: Values | None, x: Extra | None,
+             added: Terms | None) -> tuple[State, sensing.Memory, tuple[State, float, float, float]]:
     """Correct the state by a reading, advance it by the first voltage, and predict it over the other voltages."""
     if not math.isnan(theta):
         error = theta - m.stage2
         y, rate = s.theta + gain[0] * error, s.theta_dot + gain[1] * error
-        s = dynamics.State(s.i_a, s.omega, s.rotor_angle, y, rate, s.thrust, s.heat, s.flex, s.flex_dot,
+        s = State(s.i_a, s.omega, s.rotor_angle, y, rate, s.thrust, s.heat, s.flex, s.flex_dot,
                            s.gust + gain[2] * error, s.time, s.memory)
         m = sensing.Memory(m.stage1 + gain[3] * error, m.stage2 + gain[4] * error, y, rate, m.omega, m.rotor_angle,
                            m.last_pulse, m.speed, m.time)
@@ -204,17 +207,17 @@ def _observe(theta: float, volts: Array, s: dynamics.State, m: sensing.Memory, g
     stage1, stage2 = sensing.filter_angle(m, s.theta, s.theta_dot, chain)
     m = sensing.Memory(stage1, stage2, s.theta, s.theta_dot, m.omega, m.rotor_angle, m.last_pulse, m.speed, m.time)
     p = dynamics.run(volts[1:], silent, s, c, e, x, added, scratch) if len(volts) > 1 else s
-    sine, motion = math.sin(p.theta), dynamics.Motion(p.theta, p.theta_dot, 0.0, 0.0)
-    drive = dynamics.arm_drive(sine, motion, 0.0, p.omega, 0.0, c, e)
+    sine, motion = math.sin(p.theta), Motion(p.theta, p.theta_dot, 0.0, 0.0)
+    drive = arm_drive(sine, motion, 0.0, p.omega, 0.0, c, e)
     if added is not None:
-        drive += dynamics.arm_terms(motion, p.thrust, p.omega, 0.0, dynamics.Past(p.time, p.memory), c, added)
-    nominal = dynamics.arm_drive(sine, motion, 0.0, p.omega, 0.0, c, None)
-    return s, m, (p, drive, nominal, dynamics.near_ground(p.theta, e))
+        drive += arm_terms(motion, p.thrust, p.omega, 0.0, Past(p.time, p.memory), c, added)
+    nominal = arm_drive(sine, motion, 0.0, p.omega, 0.0, c, None)
+    return s, m, (p, drive, nominal, near_ground(p.theta, e))
 
 
 @njit(nogil=True)
-def _correct_motor(omega: float, i_a: float, s: dynamics.State, m: MotorCorrection, angles: Array,
-                   chain: sensing.MeasurementChain, per_volt: float) -> tuple[dynamics.State, MotorCorrection]:
+def _correct_motor(omega: float, i_a: float, s: State, m: MotorCorrection, angles: Array,
+                   chain: sensing.MeasurementChain, per_volt: float) -> tuple[State, MotorCorrection]:
     """State and correction after the readings of speed and current; `angles` (ring of samples) is updated."""
     k = m.samples
     voltage, current, read, at_pulse, outliers = m.voltage, m.current, m.read, m.at_pulse, m.outliers
@@ -249,7 +252,7 @@ def _correct_motor(omega: float, i_a: float, s: dynamics.State, m: MotorCorrecti
     if use:
         share = -math.expm1(-time / SPEED_TIME)
         voltage = min(max(voltage + share * error / per_volt, -LARGEST_BIAS), LARGEST_BIAS)
-        s = dynamics.State(s.i_a, max(s.omega + share * error, 0.0), s.rotor_angle, s.theta, s.theta_dot, s.thrust,
+        s = State(s.i_a, max(s.omega + share * error, 0.0), s.rotor_angle, s.theta, s.theta_dot, s.thrust,
                            s.heat, s.flex, s.flex_dot, s.gust, s.time, s.memory)
     return s, MotorCorrection(voltage, current, read, at_pulse, outliers, k + 1)
 

@@ -11,9 +11,9 @@ from aeropend_control.laws.allocation import Allocation
 from aeropend_control.laws.gains import Gain, checked
 from aeropend_control.laws.observer import Estimate, Observer
 from aeropend_control.laws.pid import PID
-from aeropend_sim.model import dynamics
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 from aeropend_sim.model.rig import Sample
+from aeropend_sim.model.state import State
 
 FRICTION_RATE = 0.05
 """[rad/s] Width of the smooth change of sign of the friction compensation (choice)."""
@@ -140,11 +140,11 @@ class PositionLaw:
         """Derivative of the PID's output with respect to the thrust."""
         raise NotImplementedError
 
-    def _drive(self, thrust: float, s: dynamics.State) -> tuple[float, float]:
+    def _drive(self, thrust: float, s: State) -> tuple[float, float]:
         """Duty [0..1] for a thrust [N], and the thrust [N] that results within the limits."""
         return self._allocation.duty(thrust, s)
 
-    def _friction(self, reference: float, s: dynamics.State) -> float:
+    def _friction(self, reference: float, s: State) -> float:
         """[rad/s²] Dry friction in the pivot, for the direction in which the arm moves or has to move."""
         if self._arm_friction == 0.0:
             return 0.0

@@ -5,14 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from aeropend_sim.model.dynamics import prepare
+from aeropend_sim.model.coefficients import prepare
 from aeropend_sim.model.parameters import Model, ModelError
 
 Equations = Mapping[str, Mapping[str, float]]
 
 
 def nominal(model: Model) -> dict[str, dict[str, float]]:
-    """The nominal equations, thesis (3.2) to (3.5), with the coefficients of `dynamics`: state -> term -> coefficient.
+    """The nominal equations, thesis (3.2) to (3.5), with the numbers of `coefficients`: state -> term -> coefficient.
 
     Raises:
         ModelError: the model has effects, which are not sums of terms.

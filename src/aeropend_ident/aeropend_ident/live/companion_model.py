@@ -28,7 +28,11 @@ from aeropend_ident.diagnosis.chain.priors import REFERENCE_GRAVITY
 from aeropend_ident.live.bank import Column
 from aeropend_sim.compiled import njit
 from aeropend_sim.model import actuator, dynamics, sensing
+from aeropend_sim.model.arm import advance_arm
+from aeropend_sim.model.coefficients import prepare
+from aeropend_sim.model.motor import advance_motor
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+from aeropend_sim.model.state import State, since
 
 Array = NDArray[np.float64]
 
@@ -108,14 +112,14 @@ class _Members:
         self.c, self.e, self.x, self.chain, self.states = List(), List(), List(), List(), List()
         self.added: Any = None
         for m in models:
-            c, e, x, self.added = dynamics.prepare(m, period, full=True)
+            c, e, x, self.added = prepare(m, period, full=True)
             self.c.append(c)
             self.e.append(e)
             self.x.append(x)
             self.chain.append(sensing.prepare(m, period))
-            self.states.append(dynamics.State())
+            self.states.append(State())
 
-    def start(self, state: dynamics.State) -> None:
+    def start(self, state: State) -> None:
         """Set all to a state."""
         for j in range(len(self.states)):
             self.states[j] = state
@@ -159,10 +163,10 @@ def _motor(v: Array, i_a: Array, omega: Array, states: Any, c: Any, e: Any, x: A
             s = states[j]
             for _ in range(c[j].steps):
                 past = None if added is None else dynamics.pasts(s, v[k] - bias, c[j], added)
-                i1, _, w1, angle, heat = dynamics.advance_motor(s, v[k] - bias, past, c[j], e[j], x[j], added)
-                after = dynamics.State(i1, w1, angle, 0.0, 0.0, 0.0, heat, 0.0, 0.0, 0.0, s.time, s.memory)
+                i1, _, w1, angle, heat = advance_motor(s, v[k] - bias, past, c[j], e[j], x[j], added)
+                after = State(i1, w1, angle, 0.0, 0.0, 0.0, heat, 0.0, 0.0, 0.0, s.time, s.memory)
                 if added is not None and past is not None:
-                    after = dynamics.since(after, dynamics.past_after(s, after, v[k] - bias, past, c[j], added))
+                    after = since(after, dynamics.past_after(s, after, v[k] - bias, past, c[j], added))
                 s = after
             states[j] = s
             ring[j, count % ring.shape[1]] = s.rotor_angle
@@ -267,15 +271,15 @@ def _arm(theta: Array, speed: Array, gains: Array, helped: NDArray[np.bool_], st
             w = speed[k]
             rise = (speed[k + 1] - w) / c[j].steps
             for _ in range(c[j].steps):
-                now = dynamics.State(0.0, w, 0.0, s.theta, s.theta_dot, s.thrust, 0.0, s.flex, s.flex_dot,
+                now = State(0.0, w, 0.0, s.theta, s.theta_dot, s.thrust, 0.0, s.flex, s.flex_dot,
                                      torque if helped[j] else 0.0, s.time, s.memory)
                 past = None if added is None else dynamics.pasts(now, 0.0, c[j], added)
-                m, f1 = dynamics.advance_arm(now, w + 0.5 * rise, w + rise, past, c[j], e[j], x[j], added)
+                m, f1 = advance_arm(now, w + 0.5 * rise, w + rise, past, c[j], e[j], x[j], added)
                 w += rise
-                after = dynamics.State(0.0, w, 0.0, m.theta, m.theta_dot, f1, 0.0, m.flex, m.flex_dot, 0.0, now.time,
+                after = State(0.0, w, 0.0, m.theta, m.theta_dot, f1, 0.0, m.flex, m.flex_dot, 0.0, now.time,
                                        now.memory)
                 if added is not None and past is not None:
-                    after = dynamics.since(after, dynamics.past_after(now, after, 0.0, past, c[j], added))
+                    after = since(after, dynamics.past_after(now, after, 0.0, past, c[j], added))
                 s = after
             held = sensing.Memory(stages[j, 0], stages[j, 1], before.theta, before.theta_dot, 0.0, 0.0, 0.0, 0.0, 0.0)
             first, second = sensing.filter_angle(held, s.theta, s.theta_dot, chain[j])
@@ -283,7 +287,7 @@ def _arm(theta: Array, speed: Array, gains: Array, helped: NDArray[np.bool_], st
             out[k, j] = error
             if math.isnan(error):
                 error = 0.0
-            states[j] = dynamics.State(0.0, s.omega, 0.0, s.theta + gains[0] * error, s.theta_dot + gains[1] * error,
+            states[j] = State(0.0, s.omega, 0.0, s.theta + gains[0] * error, s.theta_dot + gains[1] * error,
                                        s.thrust, 0.0, s.flex, s.flex_dot, torque + gains[2] * error if j == 1 else 0.0,
                                        s.time, s.memory)
             stages[j, 0], stages[j, 1] = first + gains[0] * error, second + gains[0] * error
@@ -357,12 +361,12 @@ class Companion:
         self._count = 0
         self._last_v = first(s.v_a, float(actuator.voltage(numbers, duty)))
         self._last_i, self._last_speed, self._last_off = i_a, omega, 0.0
-        self._motor.start(dynamics.State(i_a=i_a, omega=omega))
+        self._motor.start(State(i_a=i_a, omega=omega))
         self._ring = np.zeros((len(self._motor.states), TURNS))
         self._memory = np.zeros(8)
         self._memory[1] = omega
-        self._arm.start(dynamics.State(omega=omega, theta=theta - zero, thrust=thrust))
-        self._chain.start(dynamics.State(i_a=i_a, omega=omega, theta=theta - zero, thrust=thrust))
+        self._arm.start(State(omega=omega, theta=theta - zero, thrust=thrust))
+        self._chain.start(State(i_a=i_a, omega=omega, theta=theta - zero, thrust=thrust))
         self._stages = np.full((len(self._arm.states), 2), theta)
         self._free_stages = np.full((1, 2), theta)
         self.running = True

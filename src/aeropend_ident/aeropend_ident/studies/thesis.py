@@ -30,8 +30,10 @@ from aeropend_ident.signals.derivatives import tv_derivative
 from aeropend_ident.tables.units import RPM
 from aeropend_sim.cli.command import Parser, entry_point
 from aeropend_sim.model import actuator, dynamics, rig
+from aeropend_sim.model.coefficients import prepare
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
+from aeropend_sim.model.state import State
 
 SECONDS = 70.0
 """[s] Length of the recordings of chapter 5."""
@@ -100,7 +102,7 @@ def states(seed: int) -> tuple[Array, Array]:
     model = load("thesis")
     v = actuator.voltage(model.numbers(), Excitation(duration=SECONDS, seed=seed).series())
     out = np.empty((7, len(v)))
-    dynamics.run(v, np.zeros(len(v)), dynamics.State(), *dynamics.prepare(model, SAMPLE_PERIOD, 32), out)
+    dynamics.run(v, np.zeros(len(v)), State(), *prepare(model, SAMPLE_PERIOD, 32), out)
     return np.ascontiguousarray(out[:4].T), v
 
 

@@ -7,8 +7,10 @@ from scipy.signal import lfilter
 from aeropend_ident.identification.dataset import from_arrays
 from aeropend_ident.identification.discrepancy import in_library
 from aeropend_sim.model import actuator, dynamics
+from aeropend_sim.model.coefficients import prepare
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, load
+from aeropend_sim.model.state import State
 
 STATES = ("theta", "theta_dot", "i_a", "omega")
 THESIS = load("thesis")
@@ -21,7 +23,7 @@ def simulated(seconds, seed=0):
     """States by name, each (N,), and the voltage (N,) of the rig of the thesis."""
     v = actuator.voltage(THESIS.numbers(), Excitation(duration=seconds, seed=seed).series())
     out = np.empty((7, len(v)))
-    dynamics.run(v, np.zeros(len(v)), dynamics.State(), *dynamics.prepare(THESIS, SAMPLE_PERIOD, 32), out)
+    dynamics.run(v, np.zeros(len(v)), State(), *prepare(THESIS, SAMPLE_PERIOD, 32), out)
     return dict(zip(STATES, out[:4])), v
 
 

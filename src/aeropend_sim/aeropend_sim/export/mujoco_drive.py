@@ -6,7 +6,7 @@ from __future__ import annotations
 from aeropend_sim.export import rigid_body
 from aeropend_sim.export.plant_step import DRIVING
 from aeropend_sim.export.targets import causal, python_module
-from aeropend_sim.model import dynamics
+from aeropend_sim.model.coefficients import steps_in
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 
 DRIVER = "aeropend_mujoco.py"
@@ -71,7 +71,7 @@ def files(model: Model, period: float = SAMPLE_PERIOD) -> dict[str, str]:
         model: parameters and effects.
         period: [s] time between samples.
     """
-    arm, steps = rigid_body.arm(model), MULTIPLE * dynamics.steps_in(causal(model), period)
+    arm, steps = rigid_body.arm(model), MULTIPLE * steps_in(causal(model), period)
     driver = _TEXT.format(inertia=arm.inertia, lever=arm.lever, steps=steps, multiple=MULTIPLE, xml=XML)
     return {XML: rigid_body.mjcf(model, period, steps), DRIVER: driver,
             "aeropend_model.py": python_module(model, period, DRIVING)}

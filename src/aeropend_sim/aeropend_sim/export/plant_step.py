@@ -11,10 +11,13 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from aeropend_sim.model import actuator, dynamics, sensing
-from aeropend_sim.model.dynamics import Coefficients, Extra, State, quantities
+from aeropend_sim.model.arm import advance_arm, arm_drive, arm_terms, near_ground
+from aeropend_sim.model.coefficients import Coefficients, Extra, prepare
 from aeropend_sim.model.effects import NO_EFFECT, Values, values
+from aeropend_sim.model.motor import advance_motor, at_terminals
 from aeropend_sim.model.parameters import Model
 from aeropend_sim.model.sensing import MeasurementChain
+from aeropend_sim.model.state import Motion, State, quantities, since
 from aeropend_sim.model.terms import EMPTY, Terms, term_sum, terms
 
 
@@ -75,7 +78,7 @@ def known(model: Model, period: float) -> Known:
         model: parameters and effects.
         period: [s] time between samples.
     """
-    c, e, x, added = dynamics.prepare(model, period)
+    c, e, x, added = prepare(model, period)
     rest = None if e is None else values({id_: p for id_, p in model.effects.items() if id_ not in NATIVE}) or NO_EFFECT
     _, part = actuator.delay(model.effects, period)
     share = actuator.share_of_first(model.numbers(), part, period) if part > 0.0 else 0.0
@@ -178,21 +181,21 @@ def drive(plant: State, v: float, k: Known) -> Drive:
     """
     c, e, x, added = k.c, k.e, k.x, k.added
     past = None if added is None else dynamics.pasts(plant, v, c, added)
-    i1, wm, w1, angle, heat = dynamics.advance_motor(plant, v, past, c, e, x, added)
-    _, f1 = dynamics.advance_arm(plant, wm, w1, past, c, e, x, added)
-    middle = dynamics.Motion(plant.theta + 0.5 * c.h * plant.theta_dot, plant.theta_dot, 0.0, 0.0)
+    i1, wm, w1, angle, heat = advance_motor(plant, v, past, c, e, x, added)
+    _, f1 = advance_arm(plant, wm, w1, past, c, e, x, added)
+    middle = Motion(plant.theta + 0.5 * c.h * plant.theta_dot, plant.theta_dot, 0.0, 0.0)
     f = 0.5 * (plant.thrust + f1)
-    f += f * dynamics.near_ground(middle.theta, e)
-    torque = dynamics.arm_drive(0.0, middle, f, wm, plant.gust, k.held, k.rest)
+    f += f * near_ground(middle.theta, e)
+    torque = arm_drive(0.0, middle, f, wm, plant.gust, k.held, k.rest)
     friction = 0.0
     if e is not None:
         friction = e.coulomb_friction_accel  # type: ignore[attr-defined]
     end = State(i1, w1, angle, plant.theta, plant.theta_dot, f1, heat, 0.0, 0.0, plant.gust, plant.time, plant.memory)
     if added is not None and past is not None:
-        free = dynamics.arm_terms(middle, f, wm, 0.0, past.middle, c, added)
-        friction += free - dynamics.arm_terms(middle, f, wm, 1.0, past.middle, c, added)
+        free = arm_terms(middle, f, wm, 0.0, past.middle, c, added)
+        friction += free - arm_terms(middle, f, wm, 1.0, past.middle, c, added)
         torque += free
-        end = dynamics.since(end, dynamics.past_after(plant, end, v, past, c, added))
+        end = since(end, dynamics.past_after(plant, end, v, past, c, added))
     return Drive(end, torque, friction)
 
 
@@ -205,7 +208,7 @@ def outputs(rig: Rig, duty: float, k: Known) -> Outputs:
         k: the model.
     """
     plant = rig.plant
-    v = dynamics.at_terminals(voltage_at(duty, rig, k), plant, k.e, k.added)
+    v = at_terminals(voltage_at(duty, rig, k), plant, k.e, k.added)
     i_read, v_read = plant.i_a, v
     if k.wrong_current is not None:
         i_read = plant.i_a + term_sum(0, k.wrong_current.arm_friction, quantities(plant, v), EMPTY, k.wrong_current)

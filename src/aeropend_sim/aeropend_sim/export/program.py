@@ -11,8 +11,8 @@ from typing import Any
 
 from aeropend_sim.export import plant_step
 from aeropend_sim.export.specialise import Known, Program, Type, Value, field_of
-from aeropend_sim.model import dynamics
 from aeropend_sim.model import terms as model_terms
+from aeropend_sim.model.arm import sine_cosine
 from aeropend_sim.model.effects import Effect
 from aeropend_sim.model.formula import CONSTANTS, FUNCTIONS, QUANTITIES, parse
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
@@ -118,7 +118,7 @@ def build(model: Model, period: float = SAMPLE_PERIOD, *, library_sine: bool = F
     for terms, reading in ((known.wrong_angle, "theta"), (known.wrong_current, "i_a"), (known.wrong_voltage, "v_a")):
         formulas.hold(terms, model.effects, (reading,))
     hooks = {model_terms._entry: formulas.entry, model_terms._call: formulas.call}
-    program = Program(functions, hooks, {dynamics.sine_cosine: _library_sine_cosine} if library_sine else {})
+    program = Program(functions, hooks, {sine_cosine: _library_sine_cosine} if library_sine else {})
     for function in functions:
         program.add(function, {"k": known})
     return program

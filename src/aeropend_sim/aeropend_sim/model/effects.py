@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The catalogue of effects that a nominal model can lack: one entry per effect.
 
-To add one: an entry here, its term in `actuator.py`, `dynamics.py` or `sensing.py`, and its row in docs/effects.md. An
-effect whose term is a formula needs no source: see `effect_file`. Other forms of these effects are in `forms`.
+To add one: an entry here, its term in `actuator.py`, `motor.py`, `arm.py` or `sensing.py`, and its row in
+docs/effects.md. An effect whose term is a formula needs no source: see `effect_file`. Other forms of these effects are
+in `forms`.
 """
 
 from __future__ import annotations
@@ -17,6 +18,9 @@ PLACES = ("actuator", "electrical", "rotor", "thrust", "arm", "sensing")
 
 PARAMETER_MISMATCH = "parameter_mismatch"
 """The effect that replaces parameters of the model: their names in the model file, and their new values."""
+
+THRUST_PIVOT_SPEED = 150.0
+"""[rad/s] Speed at which `thrust_exponent` does not change the thrust (docs/effects.md). Convention."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,7 @@ class Effect:
     physics: str
     parameters: dict[str, EffectParameter]
     in_equations: bool = True
-    """Whether its term is in `dynamics`; otherwise it is in `actuator` (input) or `sensing` (reading)."""
+    """Whether its term is in `motor` or `arm`; otherwise it is in `actuator` (input) or `sensing` (reading)."""
     linear_in: Literal["", "product", "polar"] = ""
     """How the effect depends on its first two parameters, if it is not linear in the size alone.
 
@@ -193,7 +197,7 @@ _FIELDS = {f"{effect.id}_{name}": parameter.neutral
            for effect in _ENTRIES if effect.in_equations for name, parameter in effect.parameters.items()}
 
 Values = NamedTuple("Values", [(name, float) for name in _FIELDS])  # type: ignore[misc]
-"""All parameters of the effects in the equations, as `<id>_<parameter>`, for `dynamics`."""
+"""All parameters of the effects in the equations, as `<id>_<parameter>`, for `motor` and `arm`."""
 
 NO_EFFECT = Values(**_FIELDS)
 """All parameters neutral."""

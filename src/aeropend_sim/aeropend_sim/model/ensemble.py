@@ -11,10 +11,13 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from aeropend_sim.compiled import njit
-from aeropend_sim.model.dynamics import Coefficients, Lag, State, advance, equation, prepare, steps_in
+from aeropend_sim.compiled import equation, njit
+from aeropend_sim.model.coefficients import Coefficients, prepare, steps_in
+from aeropend_sim.model.dynamics import advance
 from aeropend_sim.model.effects import PARAMETER_MISMATCH, is_active
+from aeropend_sim.model.lag import Lag
 from aeropend_sim.model.parameters import DUTY_MAP, SAMPLE_PERIOD, Model
+from aeropend_sim.model.state import State
 from aeropend_sim.model.terms import EMPTY
 
 Array = NDArray[np.float64]

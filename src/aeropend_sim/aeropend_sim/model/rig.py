@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_sim.model import actuator, dynamics, sensing
+from aeropend_sim.model.coefficients import prepare
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+from aeropend_sim.model.state import State
 
 Array = NDArray[np.float64]
 
@@ -48,7 +50,7 @@ class Rig:
     def __init__(self, model: Model, seed: int = 0, period: float = SAMPLE_PERIOD) -> None:
         self.model, self.seed, self.period = model, seed, period
         self._numbers = model.numbers()
-        self._plant = dynamics.prepare(model, period)
+        self._plant = prepare(model, period)
         self._chain = sensing.prepare(model, period)
         delay = model.effect("command_delay", "delay")
         self._history = math.ceil(delay / period) + 1
@@ -60,7 +62,7 @@ class Rig:
         self._kicks, self._normal, self._uniform = (np.random.default_rng(s) for s in (kicks, normal, uniform))
         # the first angle of the propeller is random; it decides the time of the first pulse
         angle = 2.0 * math.pi * float(np.random.default_rng(turn).random())
-        self._state = dynamics.State(rotor_angle=angle)
+        self._state = State(rotor_angle=angle)
         self._memory = sensing.NOTHING_READ
         self._past = np.zeros(self._history)
         self._count = 0

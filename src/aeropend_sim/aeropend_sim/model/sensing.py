@@ -15,9 +15,10 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_sim.compiled import njit
-from aeropend_sim.model.dynamics import NO_LAG, ROW, Lag, equation, lag
+from aeropend_sim.compiled import equation, njit
+from aeropend_sim.model.dynamics import ROW
 from aeropend_sim.model.effects import DEFINED, SPIKE_FACTOR
+from aeropend_sim.model.lag import NO_LAG, Lag, lag
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 from aeropend_sim.model.terms import EMPTY, Quantities, Terms, series, term_sum, terms
 

@@ -26,8 +26,10 @@ from aeropend_ident.signals.pulses import mean_speed
 from aeropend_ident.signals.signals import Signals, split_apply
 from aeropend_ident.signals.smoothing import slow_part
 from aeropend_sim.model import actuator, dynamics, sensing
+from aeropend_sim.model.coefficients import prepare
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import Model
+from aeropend_sim.model.state import State
 
 Array = NDArray[np.float64]
 
@@ -167,7 +169,7 @@ class CutChain:
             [A] current, [rad/s] speed and [rad] rotor angle, (N,) each; NaN of values with which no motor is so fast.
         """
         first = float(self.signals.i_a[0]) if np.isfinite(self.signals.i_a[0]) else 0.0
-        state = dynamics.State(i_a=first, omega=values.get("initial.omega", 0.0))
+        state = State(i_a=first, omega=values.get("initial.omega", 0.0))
         if not self.signals.has("v_a"):
             voltage = self._voltage(values, actuator.acting_voltage)
         else:
@@ -176,7 +178,7 @@ class CutChain:
         for piece, whole in self.pieces(values, stop):
             m = actuator.behind_terminals(whole)
             true = sensing.true_voltage(m, voltage[piece], self.signals.time[piece])
-            part, prepared = np.full((3, len(true)), np.nan), dynamics.prepare(m, self.signals.period)
+            part, prepared = np.full((3, len(true)), np.nan), prepare(m, self.signals.period)
             if prepared[0].h >= SHORTEST_STEP:
                 state = dynamics.run_motor(true, state, *prepared, part)
             out[:, piece] = part
@@ -233,7 +235,7 @@ class CutChain:
             speed = np.zeros(len(s))[:stop]  # the rotor stands
         else:
             speed = self.speed[:stop] if cut else s.turning(self.motor(values, stop)[1])
-        state = dynamics.State(omega=float(speed[0]), theta=values.get("initial.theta", 0.0),
+        state = State(omega=float(speed[0]), theta=values.get("initial.theta", 0.0),
                                theta_dot=values.get("initial.theta_dot", 0.0),
                                thrust=float(actuator.thrust(n, speed[0])))
         theta, rate = np.empty(len(speed)), np.empty(len(speed))

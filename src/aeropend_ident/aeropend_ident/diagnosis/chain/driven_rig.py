@@ -35,8 +35,9 @@ from aeropend_ident.diagnosis.policy import UNCALIBRATED
 from aeropend_ident.estimation.map_fit import ENOUGH, Fit, Search, Sensitivities, fit, passed
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals
-from aeropend_sim.model import actuator, dynamics
-from aeropend_sim.model.effects import DEFINED
+from aeropend_sim.model import actuator
+from aeropend_sim.model.coefficients import LONGEST_STEP
+from aeropend_sim.model.effects import DEFINED, THRUST_PIVOT_SPEED
 from aeropend_sim.model.parameters import Model
 
 Array = NDArray[np.float64]
@@ -148,7 +149,7 @@ def fit_driven_rig(model: Model, recordings: Sequence[Signals], deadline: float 
         deadline: [s] of `time.monotonic` after which no further term is looked for.
     """
     units = units_of(model, recordings)
-    scaled = [downsampled(units.of(s), dynamics.LONGEST_STEP) for s in recordings]
+    scaled = [downsampled(units.of(s), LONGEST_STEP) for s in recordings]
     begun = units.model(model)
     full, plain = _searched(begun, scaled, model.effects, deadline)
     chosen = None if full is None else _chosen(full, scaled, model.effects, deadline)
@@ -425,7 +426,7 @@ def lift(model: Model, recordings: Sequence[Signals]) -> Lift:
     duty = np.linspace(0.0, max(s.largest_duty for s in recordings), CURVE)
     speed = actuator.speed_at(n, actuator.voltage(n, duty))
     middle = float(speed[CURVE // 2])
-    pivot = dynamics.THRUST_PIVOT_SPEED
+    pivot = THRUST_PIVOT_SPEED
     thrust = n["k_thrust"] * pivot**2 * (np.maximum(speed, 0.0) / pivot) ** model.effect("thrust_exponent", "n")
     return Lift(duty=tuple(duty.tolist()), rad_per_s2=tuple((n["L_over_J"] * thrust).tolist()),
                 dead_zone=max(((n["k0"] / n["k1"]) ** 2 - n["k3"]) / n["k2"], 0.0) if n["k0"] < 0.0 else 0.0,

@@ -15,7 +15,9 @@ from aeropend_ident.diagnosis.chain.values import acts_on_motor, with_values, wi
 from aeropend_ident.signals.pulses import mean_speed
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import actuator, dynamics, sensing
+from aeropend_sim.model.coefficients import LONGEST_STEP, prepare
 from aeropend_sim.model.parameters import Model
+from aeropend_sim.model.state import State
 
 Array = NDArray[np.float64]
 Values = Mapping[str, float]
@@ -82,9 +84,9 @@ class StagedRun:
         i_a, v_a, omega, angle = np.empty((4, len(s)))
         for piece, m in pieces:
             v, sampled = _voltages(s, piece, m)
-            parts = math.ceil(s.period / dynamics.LONGEST_STEP - 1e-9)  # within which the speed is a straight line
+            parts = math.ceil(s.period / LONGEST_STEP - 1e-9)  # within which the speed is a straight line
             out = np.empty((3, parts * len(v)))
-            state = dynamics.run_motor(np.repeat(v, parts), state, *dynamics.prepare(m, s.period / parts), out)
+            state = dynamics.run_motor(np.repeat(v, parts), state, *prepare(m, s.period / parts), out)
             i_a[piece], omega[piece], angle[piece] = out[:, ::parts]
             v_a[piece] = actuator.terminal_voltage(m, sampled, i_a[piece], s.period)
             speed.append(out[1])
@@ -106,10 +108,10 @@ def _pieces(model: Model, signals: Signals, values: Values) -> Pieces:
     return [(piece, with_values(model, values if acts else off)) for piece, acts in signals.acting()]
 
 
-def _begin(pieces: Pieces, values: Values) -> dynamics.State:
+def _begin(pieces: Pieces, values: Values) -> State:
     """The state at the first sample."""
     n, omega = pieces[0][1].numbers(), values.get("initial.omega", 0.0)
-    return dynamics.State(i_a=float(actuator.current_at(n, omega)), omega=omega,
+    return State(i_a=float(actuator.current_at(n, omega)), omega=omega,
                           theta=values.get("initial.theta", 0.0), theta_dot=values.get("initial.theta_dot", 0.0),
                           thrust=float(actuator.thrust(n, omega)))
 
@@ -127,7 +129,7 @@ def _run(signals: Signals, pieces: Pieces, values: Values) -> dynamics.Trajector
     for piece, m in pieces:
         v, sampled = _voltages(signals, piece, m)
         part = np.empty((7, len(v)))
-        state = dynamics.run(v, np.zeros(len(v)), state, *dynamics.prepare(m, signals.period), part)
+        state = dynamics.run(v, np.zeros(len(v)), state, *prepare(m, signals.period), part)
         if "command_delay" in m.effects:
             part[dynamics.ROW.v_a] += sampled - v
         out[:, piece] = part

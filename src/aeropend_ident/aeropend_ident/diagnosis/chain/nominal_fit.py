@@ -48,7 +48,9 @@ from aeropend_ident.signals.noise import resolution
 from aeropend_ident.signals.signals import Signals
 from aeropend_ident.signals.smoothing import block_mean
 from aeropend_sim.model import dynamics
+from aeropend_sim.model.coefficients import prepare
 from aeropend_sim.model.parameters import DUTY_MAP, Model
+from aeropend_sim.model.state import State
 
 Array = NDArray[np.float64]
 
@@ -125,7 +127,7 @@ def _possible(model: Model, recordings: Sequence[Signals]) -> Model:
     Raises:
         RecordingError: no motor is so fast.
     """
-    if any(dynamics.prepare(model, s.period)[0].h < SHORTEST_STEP for s in recordings):
+    if any(prepare(model, s.period)[0].h < SHORTEST_STEP for s in recordings):
         raise RecordingError("no motor has the speed, current and voltage that were read: check their units, and that "
                              "no column stands for another (doctor); no verdict is possible")
     return model
@@ -204,8 +206,8 @@ def _best_inertia(model: Model, recordings: Sequence[Signals]) -> float:
         for s in recordings:
             v = np.interp(np.arange(len(s)), np.flatnonzero(np.isfinite(s.v_a)), s.v_a[np.isfinite(s.v_a)])
             out = np.empty((3, len(v)))
-            dynamics.run_motor(v, dynamics.State(omega=float(np.nan_to_num(s.omega[0]))),
-                               *dynamics.prepare(replace(model, model=n, effects={}), s.period), out)
+            dynamics.run_motor(v, State(omega=float(np.nan_to_num(s.omega[0]))),
+                               *prepare(replace(model, model=n, effects={}), s.period), out)
             squares += float(np.nansum((s.true_speed - out[1]) ** 2))
         tried.append((squares, n["J_m"]))
     return min(tried)[1]

@@ -19,8 +19,10 @@ from aeropend_ident.signals import smoothing
 from aeropend_ident.signals.signals import Signals
 from aeropend_ident.signals.smoothing import block_mean
 from aeropend_sim.model import actuator, dynamics
-from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model.coefficients import prepare
+from aeropend_sim.model.effects import CATALOGUE, THRUST_PIVOT_SPEED
 from aeropend_sim.model.parameters import Model
+from aeropend_sim.model.state import State
 
 Array = NDArray[np.float64]
 
@@ -135,10 +137,10 @@ def unit_lift(model: Model, s: Signals) -> Array:
     hangs = abs(float(np.mean(s.theta[np.isfinite(s.theta)][:3]))) < HANGS
     before = 0.0 if hangs else float(s.duty[0])
     v = actuator.acting_voltage(n, s.duty, model.effects, s.period, before=before)
-    state = dynamics.State(omega=0.0 if hangs else float(actuator.speed_at(n, v[0])))
+    state = State(omega=0.0 if hangs else float(actuator.speed_at(n, v[0])))
     out = np.empty((3, len(v)))
-    dynamics.run_motor(v, state, *dynamics.prepare(model.with_effects({}), s.period), out)
-    pivot = dynamics.THRUST_PIVOT_SPEED
+    dynamics.run_motor(v, state, *prepare(model.with_effects({}), s.period), out)
+    pivot = THRUST_PIVOT_SPEED
     u = np.sign(out[1]) * pivot**2 * (np.abs(out[1]) / pivot) ** model.effect("thrust_exponent", "n")
     tau = model.effect("thrust_lag", "tau")
     return smoothing.lag(u, tau, s.period, model.effect("thrust_lag", "fall")) if tau > 0.0 else u

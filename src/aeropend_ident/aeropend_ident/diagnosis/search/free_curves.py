@@ -27,7 +27,7 @@ from aeropend_ident.signals.smoothing import lag
 from aeropend_ident.signals.statistics import effective_sample_size
 from aeropend_sim.compiled import njit
 from aeropend_sim.model import sensing
-from aeropend_sim.model.dynamics import linear_arm
+from aeropend_sim.model.arm import linear_arm
 
 Array = NDArray[np.float64]
 

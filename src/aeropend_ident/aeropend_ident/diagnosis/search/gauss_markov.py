@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from aeropend_ident.signals.smoothing import block_mean
 from aeropend_ident.signals.statistics import Z95
 from aeropend_sim.compiled import njit
-from aeropend_sim.model.dynamics import linear_arm
+from aeropend_sim.model.arm import linear_arm
 from aeropend_sim.model.effects import CATALOGUE
 
 Array = NDArray[np.float64]
