@@ -38,6 +38,7 @@ class Allocation:
         """
         model = observer.model
         self._observer, self._numbers = observer, model.numbers()
+        self._duty_map = actuator.duty_map(self._numbers)
         self.thrust_time = thrust_time
         self._bridge_drop = model.in_any_form("bridge_drop", "v_drop")
         self._supply_drift = model.in_any_form("supply_drift", "rate")
@@ -96,7 +97,7 @@ class Allocation:
         if thrust <= 0.0:
             return 0.0
         if exponent == 2.0:
-            return float(actuator.speed(self._numbers, thrust))
+            return actuator.speed(self._numbers, thrust)
         return pivot * (thrust / (self._numbers["k_thrust"] * pivot**2)) ** (1.0 / exponent)
 
     def resistance(self, s: State) -> float:
@@ -106,7 +107,7 @@ class Allocation:
     def holding_current(self, speed: float, wanted: float) -> float:
         """[A] Steady current at a speed [rad/s], with dry friction if the demanded speed `wanted` [rad/s] is > 0."""
         friction = self._rotor_friction / self._numbers["K_t"] if wanted > 0.0 else 0.0
-        return float(actuator.current_at(self._numbers, speed)) + friction
+        return actuator.current_at(self._numbers, speed) + friction
 
     def drop(self, current: float, s: State) -> float:
         """[V] Voltage drop of a steady current [A] in winding, brushes and supply."""
@@ -123,5 +124,5 @@ class Allocation:
             The duty [0..1], and the voltage [V] that results within the limits of the duty.
         """
         left = max(1e-3, 1.0 - self._supply_drift * self._observer.count * self._observer.period)
-        duty = float(actuator.duty(self._numbers, (wanted + self._bridge_drop) / left)) if wanted > 0.0 else 0.0
-        return duty, max(0.0, float(actuator.voltage(self._numbers, duty)) * left - self._bridge_drop)
+        duty = actuator.unmapped((wanted + self._bridge_drop) / left, self._duty_map) if wanted > 0.0 else 0.0
+        return duty, max(0.0, actuator.mapped(duty, self._duty_map) * left - self._bridge_drop)

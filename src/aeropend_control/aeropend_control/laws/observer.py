@@ -117,11 +117,9 @@ class Observer:
         self._gain = _kalman(self._chain, self.numbers["c_over_J"], period)
         n = self.numbers
         self._per_volt = n["K_t"] / (n["R_a"] * n["B_m"] + n["K_e"] * n["K_t"])  # rad/s, without load
-        delay = model.effect("command_delay", "delay") / period
-        self._whole = math.floor(delay + 1e-9)
-        self._effects = dict(model.effects)
-        if delay > 0.0:  # the queue delays by whole periods
-            self._effects["command_delay"] = {"delay": max(delay - self._whole, 0.0) * period}
+        self._duty_map = actuator.duty_map(n)
+        self._whole, part = actuator.delay(model.effects, period)
+        self._share = actuator.share_of_first(n, part, period) if part else 0.0
         self.reset()
 
     def reset(self, duty: float = 0.0, theta: float = math.nan) -> None:
@@ -185,9 +183,13 @@ class Observer:
 
     def _voltage(self, duty: float) -> float:
         """[V] Voltage, without sag, in the sample period in which this duty begins to act."""
-        held, self._duty = np.array([self._duty, duty]), duty
-        start = self.count + self._whole - 1
-        return float(actuator.acting_voltage(self.numbers, held, self._effects, self.period, start, held[0])[1])
+        before, self._duty = self._duty, duty
+        time, effects = (self.count + self._whole) * self.period, self.model.effects
+        v = float(actuator.at_bridge(actuator.mapped(duty, self._duty_map), time, effects))
+        if self._share == 0.0:
+            return v
+        first = float(actuator.at_bridge(actuator.mapped(before, self._duty_map), time, effects))
+        return float(actuator.acting(first, v, self._share))
 
 
 @njit(nogil=True)

@@ -49,7 +49,7 @@ class Outputs(NamedTuple):
 class Known(NamedTuple):
     """What a model fixes, for the functions below."""
 
-    numbers: Mapping[str, float]
+    duty_map: actuator.DutyMap
     effects: Mapping[str, Mapping[str, float]]
     period: float
     share: float
@@ -81,10 +81,11 @@ def known(model: Model, period: float) -> Known:
     c, e, x, added = prepare(model, period)
     rest = None if e is None else values({id_: p for id_, p in model.effects.items() if id_ not in NATIVE}) or NO_EFFECT
     _, part = actuator.delay(model.effects, period)
-    share = actuator.share_of_first(model.numbers(), part, period) if part > 0.0 else 0.0
+    numbers = model.numbers()
+    share = actuator.share_of_first(numbers, part, period) if part > 0.0 else 0.0
     angle, current, voltage = (terms(model.effects, (reading,)) for reading in ("theta", "i_a", "v_a"))
-    return Known(model.numbers(), model.effects, period, share, c, e, x, added, sensing.prepare(model, period),
-                 angle, current, voltage, c._replace(gravity=0.0, damping=0.0), rest)
+    return Known(actuator.duty_map(numbers), model.effects, period, share, c, e, x, added,
+                 sensing.prepare(model, period), angle, current, voltage, c._replace(gravity=0.0, damping=0.0), rest)
 
 
 def begin(theta: float, k: Known) -> Rig:
@@ -104,7 +105,7 @@ def see(plant: State, t: float, k: Known) -> tuple[float, float]:
 
 def voltage_at(duty: float, rig: Rig, k: Known) -> float:
     """[V] Voltage at the bridge that a duty gives now."""
-    return actuator.at_bridge(actuator.voltage(k.numbers, duty), rig.samples * k.period, k.effects)  # type: ignore[return-value]
+    return actuator.at_bridge(actuator.mapped(duty, k.duty_map), rig.samples * k.period, k.effects)  # type: ignore[return-value]
 
 
 def held_voltage(rig: Rig, duty: float, before: float, k: Known) -> float:

@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Duty to voltage to speed to thrust in steady state, and the inverse functions for the controllers.
 
-All functions take and return scalars or arrays of one shape, in SI units. A duty is a fraction 0..1, or -1..1 if the
-bridge reverses or brakes the motor. `numbers` are the parameters of the model by name, from `Model.numbers`.
+Scalars and arrays (N,) are in SI units. A duty is a fraction 0..1, or -1..1 if the bridge reverses or brakes the motor.
+`numbers` are the parameters of the model by name, from `Model.numbers`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from aeropend_sim.compiled import njit
 from aeropend_sim.model.effects import DEFINED
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 from aeropend_sim.model.terms import series
@@ -22,64 +23,104 @@ Array = NDArray[np.float64]
 Numbers = Mapping[str, float]
 
 
-def voltage(numbers: Numbers, duty: ArrayLike) -> Array:
+ScalarOrArray = TypeVar("ScalarOrArray", float, Array)
+
+
+class DutyMap(NamedTuple):
+    """The parameters of the map from duty to voltage; `full` is 0 where k0 to k3 describe it."""
+
+    k0: float
+    k1: float
+    k2: float
+    k3: float
+    full: float
+    reverse: float
+
+
+def duty_map(numbers: Numbers) -> DutyMap:
+    """The map of a model."""
+    full = numbers.get("v_full", 0.0)
+    k0, k1, k2, k3 = (0.0,) * 4 if full > 0.0 else (numbers[name] for name in ("k0", "k1", "k2", "k3"))
+    return DutyMap(k0, k1, k2, k3, full, numbers.get("reverse", 0.0))
+
+
+@njit()
+def mapped(duty: float, m: DutyMap) -> float:
+    """Voltage (V) that a duty gives; see `voltage`."""
+    size = abs(duty)
+    v = m.full * size if m.full > 0.0 else m.k0 + m.k1 * math.sqrt(m.k2 * size + m.k3)
+    if v < 0.0:
+        v = 0.0
+    return -m.reverse * v if duty < 0.0 else v
+
+
+@njit(error_model="numpy")  # a fit may try a map that does not depend on the duty
+def unmapped(voltage: float, m: DutyMap) -> float:
+    """Duty that gives a voltage (V); see `duty`."""
+    if voltage == 0.0 or (voltage < 0.0 and m.reverse <= 0.0):
+        return 0.0
+    size = -voltage / m.reverse if voltage < 0.0 else voltage
+    if m.full > 0.0:
+        found = size / m.full
+    else:
+        root = max(0.0, (size - m.k0) / m.k1)
+        found = max((root * root - m.k3) / m.k2, 0.0)
+    found = min(found, 1.0)
+    return -found if voltage < 0.0 else found
+
+
+@njit()
+def _each_mapped(duty: Array, m: DutyMap) -> Array:
+    out = np.empty(len(duty))
+    for k in range(len(duty)):
+        out[k] = mapped(duty[k], m)
+    return out
+
+
+def voltage(numbers: Numbers, duty: ScalarOrArray) -> ScalarOrArray:
     """Voltage (V) that a duty gives: v = max(0, k0 + k1 sqrt(k2 τ + k3)), thesis (4.3), or v = v_full τ.
 
     For a duty below 0 it is -reverse v(|τ|). With `reverse` 0 the terminals are then shorted: the motor brakes.
     """
-    duty = np.asarray(duty, dtype=float)
-    size, full = np.abs(duty), numbers.get("v_full", 0.0)
-    v = full * size if full > 0.0 else (
-        np.maximum(0.0, numbers["k0"] + numbers["k1"] * np.sqrt(numbers["k2"] * size + numbers["k3"])))
-    return np.where(duty < 0.0, -numbers.get("reverse", 0.0) * v, v)
+    m = duty_map(numbers)
+    if isinstance(duty, np.ndarray):
+        return _each_mapped(np.ascontiguousarray(duty, dtype=float), m)
+    return mapped(float(duty), m)
 
 
-def duty(numbers: Numbers, voltage: ArrayLike) -> Array:
+def duty(numbers: Numbers, voltage: float) -> float:
     """Duty that gives a voltage (V), clipped to its range. At 0 V, the dead zone of the map, it is 0.
 
     So it is below 0 V, unless the bridge reverses the motor.
     """
-    v = np.asarray(voltage, dtype=float)
-    reverse, full = numbers.get("reverse", 0.0), numbers.get("v_full", 0.0)
-    size = np.where(v < 0.0, -v / reverse if reverse > 0.0 else 0.0, v)
-    if full > 0.0:
-        found = np.minimum(size / full, 1.0)
-    else:
-        root = np.maximum(0.0, (size - numbers["k0"]) / numbers["k1"])
-        found = np.minimum(np.maximum((root * root - numbers["k3"]) / numbers["k2"], 0.0), 1.0)
-    return np.where(size <= 0.0, 0.0, np.where(v < 0.0, -found, found))
+    return unmapped(float(voltage), duty_map(numbers))
 
 
-def thrust(numbers: Numbers, speed: ArrayLike) -> Array:
+def thrust(numbers: Numbers, speed: ScalarOrArray) -> ScalarOrArray:
     """Static thrust (N) of a speed (rad/s): f = k_thrust ω|ω|."""
-    speed = np.asarray(speed, dtype=float)
-    return numbers["k_thrust"] * speed * np.abs(speed)
+    return numbers["k_thrust"] * speed * abs(speed)
 
 
-def speed(numbers: Numbers, thrust: ArrayLike) -> Array:
+def speed(numbers: Numbers, thrust: float) -> float:
     """Speed (rad/s) that gives a static thrust (N)."""
-    thrust = np.asarray(thrust, dtype=float)
-    return np.sign(thrust) * np.sqrt(np.abs(thrust) / numbers["k_thrust"])
+    return math.copysign(math.sqrt(abs(thrust) / numbers["k_thrust"]), thrust)
 
 
-def current_at(numbers: Numbers, speed: ArrayLike) -> Array:
+def current_at(numbers: Numbers, speed: ScalarOrArray) -> ScalarOrArray:
     """Armature current (A) that holds a speed (rad/s): K_t i = B_m ω + k_load ω|ω|."""
-    speed = np.asarray(speed, dtype=float)
-    return (numbers["B_m"] * speed + numbers["k_load"] * speed * np.abs(speed)) / numbers["K_t"]
+    return (numbers["B_m"] * speed + numbers["k_load"] * speed * abs(speed)) / numbers["K_t"]
 
 
-def voltage_at(numbers: Numbers, speed: ArrayLike) -> Array:
+def voltage_at(numbers: Numbers, speed: ScalarOrArray) -> ScalarOrArray:
     """Armature voltage (V) that holds a speed (rad/s): v = R_a i + K_e ω, thesis (3.5) at rest."""
-    speed = np.asarray(speed, dtype=float)
     return numbers["R_a"] * current_at(numbers, speed) + numbers["K_e"] * speed
 
 
-def speed_at(numbers: Numbers, voltage: ArrayLike) -> Array:
+def speed_at(numbers: Numbers, voltage: ScalarOrArray) -> ScalarOrArray:
     """Steady speed (rad/s) of an armature voltage (V): the inverse of `voltage_at`."""
-    v = np.asarray(voltage, dtype=float)
     a = numbers["R_a"] * numbers["k_load"] / numbers["K_t"]
     b = numbers["R_a"] * numbers["B_m"] / numbers["K_t"] + numbers["K_e"]
-    return 2.0 * v / (b + np.sqrt(b * b + 4.0 * a * np.abs(v)))
+    return 2.0 * voltage / (b + np.sqrt(b * b + 4.0 * a * abs(voltage)))
 
 
 def voltages(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, float]],
@@ -139,7 +180,7 @@ def _over_hold(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str,
                before: float) -> tuple[Array, Array, float]:
     """Voltage (N,) at the start of each hold, voltage (N,) after a delayed change, and share of the hold before it."""
     n, (whole, part) = len(duty), delay(effects, period)
-    time = (start + np.arange(n)) * period
+    time = (start + np.arange(n)) * period if "supply_drift" in effects else np.zeros(0)
     if whole == 0 and part == 0.0:
         v = at_bridge(voltage(numbers, duty), time, effects)
         return v, v, 0.0
@@ -164,9 +205,6 @@ def at_bridge(v: ArrayLike, time: ArrayLike, effects: Mapping[str, Mapping[str, 
     if "bridge_drop" in effects:
         acts = np.sign(acts) * np.maximum(0.0, np.abs(acts) - effects["bridge_drop"]["v_drop"])
     return acts
-
-
-ScalarOrArray = TypeVar("ScalarOrArray", float, Array)
 
 
 def terminal_voltage(model: Model, voltage: ScalarOrArray, current: ScalarOrArray, period: float = SAMPLE_PERIOD
@@ -195,7 +233,7 @@ def behind_terminals(model: Model) -> Model:
         id_ in DEFINED and DEFINED[id_].term and DEFINED[id_].place == "actuator")})
 
 
-def static_angle(numbers: Numbers, duty: ArrayLike) -> Array:
+def static_angle(numbers: Numbers, duty: ScalarOrArray) -> ScalarOrArray:
     """Angle (rad) at which a duty holds the arm; NaN if the thrust exceeds the weight of the arm."""
     f = thrust(numbers, speed_at(numbers, voltage(numbers, duty)))
     with np.errstate(invalid="ignore"):

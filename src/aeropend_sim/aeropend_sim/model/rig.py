@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,8 +52,9 @@ class Rig:
         self._numbers = model.numbers()
         self._plant = prepare(model, period)
         self._chain = sensing.prepare(model, period)
+        self._errors = sensing.readings_with_errors(model)
         delay = model.effect("command_delay", "delay")
-        self._history = math.ceil(delay / period) + 1
+        self._history = math.ceil(delay / period) + 1 if delay else 0
         self.reset()
 
     def reset(self) -> None:
@@ -77,18 +78,16 @@ class Rig:
             Readings (4, N) in the order of `Sample`, and states (7, N) in the order of `dynamics.Trajectory`.
         """
         duty = np.ascontiguousarray(duty, dtype=float)
-        n = len(duty)
-        known = np.concatenate([self._past, duty])
-        start = self._count - len(self._past)
-        v, sampled = (x[len(self._past):] for x in actuator.voltages(
-            self._numbers, known, self.model.effects, self.period, start))
-        self._past = known[-self._history:]
+        n, before = len(duty), len(self._past)
+        known = np.concatenate([self._past, duty]) if before else duty
+        v, sampled = actuator.voltages(self._numbers, known, self.model.effects, self.period, self._count - before)
+        if before:
+            v, sampled, self._past = v[before:], sampled[before:], known[-before:]
         truth, read = np.empty((7, n)), np.empty((4, n))
         self._state = dynamics.run(v, self._kicks.standard_normal(n), self._state, *self._plant, truth)
-        truth[dynamics.ROW.v_a] += sampled - v
-        angle = sensing.seen_angle(self.model, truth[dynamics.ROW.theta], truth[dynamics.ROW.theta_dot], self.period,
-                                   self._count * self.period)
-        seen = _with_errors(self.model, truth, *angle, self.period * np.arange(self._count, self._count + n))
+        if sampled is not v:
+            truth[dynamics.ROW.v_a] += sampled - v
+        seen = _with_errors(self.model, truth, self._count, self.period) if self._errors else truth
         self._memory = sensing.read(read, seen, self._normal.standard_normal((n, 4)), self._uniform.random((n, 2)),
                                     self._memory, self._count == 0, self._chain)
         self._count += n
@@ -104,12 +103,12 @@ class Rig:
         return Sample(*read[:, 0].tolist()), Truth(*truth[:len(Truth._fields), 0].tolist())
 
 
-def _with_errors(model: Model, truth: Array, theta: Array, theta_dot: Array, time: NDArray[np.floating[Any]]) -> Array:
+def _with_errors(model: Model, truth: Array, start: int, period: float) -> Array:
     """The states (7, N) as the sensors see them: with the errors of readings that are given by formulas."""
-    if not sensing.readings_with_errors(model):
-        return truth
     seen, row = truth.copy(), dynamics.ROW
-    seen[row.theta], seen[row.theta_dot] = theta, theta_dot
+    time = period * np.arange(start, start + truth.shape[1])
+    seen[row.theta], seen[row.theta_dot] = sensing.seen_angle(model, truth[row.theta], truth[row.theta_dot], period,
+                                                              start * period)
     alone = model.with_effects({id_: p for id_, p in model.effects.items() if id_ not in CATALOGUE})
     seen[row.i_a] = sensing.read_current(alone, truth[row.i_a], time)
     seen[row.v_a] = sensing.read_voltage(alone, truth[row.v_a], time)

@@ -113,8 +113,7 @@ class CutChain:
             n = m.numbers()
             # the duty before the recording is taken from the first voltage: with a delay it acts for a while
             first = s.v_a[0] if np.isfinite(s.v_a[0]) else actuator.voltage_at(n, values.get("initial.omega", 0.0))
-            with np.errstate(all="ignore"):  # a fit may try a bridge whose voltage does not depend on the duty
-                before = float(np.nan_to_num(actuator.duty(n, first)))
+            before = float(np.nan_to_num(actuator.duty(n, first)))
             v = of(n, s.duty, m.effects, s.period, start=-piece.start, before=before)
             seen = actuator.terminal_voltage(m, v[piece], self.current[piece], s.period)
             out[piece] = sensing.read_voltage(m, seen, s.time[piece])
