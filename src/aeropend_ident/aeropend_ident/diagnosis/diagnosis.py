@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +62,7 @@ from aeropend_ident.diagnosis.search.free_curves import MissingTerm, Repeatable
 from aeropend_ident.diagnosis.search.learned_term import Learned, learn
 from aeropend_ident.diagnosis.search.onset import Onset
 from aeropend_ident.diagnosis.search.search import refit, search, trifling_gap, unsearched
-from aeropend_ident.diagnosis.search.unknown_effect import UnknownEffect
+from aeropend_ident.diagnosis.search.unknown_effect import ONE_TERM, UnknownEffect
 from aeropend_ident.estimation.map_fit import passed
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import CHANNELS, Signals
@@ -246,6 +246,35 @@ class _Gaps:
                       jobs=jobs)
 
 
+class _Measured(NamedTuple):
+    """Findings, fitted jointly, with the gap that they leave and its parts."""
+
+    found: _Findings
+    joint: JointFit
+    gaps: _Gaps
+    parts: list[Part]
+
+    @property
+    def open_(self) -> float:
+        """The squared gap that effects close, or leave and could be closed."""
+        return sum(max(p.amount, 0.0) for p in self.parts)
+
+    @property
+    def excess(self) -> float:
+        """What is left of the squared gap above the floor."""
+        after = self.gaps.after
+        return max(gap_share.squared(after) - after.total_floor(self.gaps.floors)**2, 0.0)
+
+    def closes_more(self, other: _Measured, material: float) -> bool:
+        """Whether this leaves less than other findings, by a material share of what is open."""
+        less = gap_share.squared(other.gaps.after) - gap_share.squared(self.gaps.after)
+        return less > material * other.open_
+
+    def shows_approximation(self, known: _Measured, material: float) -> bool:
+        """Whether this, with one unknown term, leaves so little that known effects only approximate that term."""
+        return self.closes_more(known, material) and known.excess > ONE_TERM * self.excess
+
+
 def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diagnosis:
     """The steps after the chain is cut; `fitted`: the chains whose training part parameters are fitted to."""
     found = _find(fitted, settings, progress)
@@ -256,24 +285,19 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     closed = [stage for stage in found.stages if gaps.after.within(gaps.floors, CHANNELS_OF[stage])]
     if found.unknown is not None and found.unknown.stage in closed:
         found = _judged(found, closed)
-    found, joint, gaps, parts = _without_harmful(fitted, found, joint, gaps, settings, progress)
-    if found.unknown is not None and not _repeats(parts, settings.material):
-        found = replace(found, unknown=None)
-        parts = _parts(found, joint, gaps, settings)
-    before = (found, joint, gaps, parts)
-    if found.unknown is not None and _approximated(found.unknown, joint, gaps, parts):
-        stage = found.unknown.stage
-        stages = {**found.stages, stage: found.stages[stage].nothing()}
-        found, joint, gaps = _fit_and_measure(fitted, replace(found, stages=stages), progress)
-        parts = _parts(found, joint, gaps, settings)
-    if found.unknown is not None and gap_share.headline(
-            parts, gap_share.shares(parts), settings.material).verdict == gap_share.UNKNOWN:
-        if passed(settings.deadline):
-            found = replace(found, recordings=[s.noted(NOT_LEARNED) for s in found.recordings])
-        else:
-            found, joint, gaps, parts = _with_learned_term(fitted, found, joint, gaps, parts, settings, progress)
-    if found.stages is not before[0].stages and not _closes_more(gaps.after, *before[2:], settings.material):
-        found, joint, gaps, parts = before  # what was taken back predicts as well as what can be learned in its place
+    now = _without_harmful(fitted, found, joint, gaps, settings, progress)
+    if now.found.unknown is not None and not _repeats(now.parts, settings.material):
+        known = replace(now.found, unknown=None)
+        now = now._replace(found=known, parts=_parts(known, now.joint, now.gaps, settings))
+    if _may_approximate(now):
+        alone = _with_learned_term(fitted, _unknown_alone(fitted, now, settings, progress), settings, progress)
+        if alone.shows_approximation(now, settings.material):
+            now = alone
+        elif alone.found.learned is not None:
+            effect_file.forget(alone.found.learned.id)
+    if now.found.learned is None:
+        now = _with_learned_term(fitted, now, settings, progress)
+    found, joint, gaps, parts = now
     conclusions = _conclude(found, joint, gaps, parts, settings)
     model, chains = found.chains.model, found.chains
     nominal = model if chains.policy.calibrated else with_values(model, of_rig(gaps.base))
@@ -317,8 +341,8 @@ def _fit_and_measure(fitted: CutChains, found: _Findings, progress: Progress) ->
 
 
 def _without_harmful(fitted: CutChains, found: _Findings, joint: JointFit, gaps: _Gaps, settings: Settings,
-                     progress: Progress) -> tuple[_Findings, JointFit, _Gaps, list[Part]]:
-    """Take out the effects that make the gap larger on data that no fit has used; also returns the parts of the gap.
+                     progress: Progress) -> _Measured:
+    """Take out the effects that make the gap larger on data that no fit has used.
 
     These have a negative part, or the others leave less without them. One at a time, the most harmful first: of effects
     that stand in for each other, one may be needed.
@@ -337,26 +361,30 @@ def _without_harmful(fitted: CutChains, found: _Findings, joint: JointFit, gaps:
             continue
         found, joint, gaps = without
         parts = _parts(found, joint, gaps, settings)
-    return found, joint, gaps, parts
+    return _Measured(found, joint, gaps, parts)
 
 
-def _with_learned_term(fitted: CutChains, found: _Findings, joint: JointFit, gaps: _Gaps, parts: list[Part],
-                       settings: Settings, progress: Progress) -> tuple[_Findings, JointFit, _Gaps, list[Part]]:
-    """Learn the term that the unknown effect adds, and measure again; nothing changes where it does not help."""
-    assert found.unknown is not None
-    progress("learning the missing term", 0.92)
+def _with_learned_term(fitted: CutChains, now: _Measured, settings: Settings, progress: Progress) -> _Measured:
+    """Learn the term that the unknown effect adds, if that is the verdict; nothing changes where it does not help."""
+    found, joint, _, parts = now
     unknown = found.unknown
+    if unknown is None or (gap_share.headline(parts, gap_share.shares(parts), settings.material).verdict
+                           != gap_share.UNKNOWN):
+        return now
+    if passed(settings.deadline):
+        return now._replace(found=replace(found, recordings=[s.noted(NOT_LEARNED) for s in found.recordings]))
+    progress("learning the missing term", 0.92)
     learned = learn(found.chains, joint.findings[unknown.stage], unknown.term.place, settings.jobs)
     if learned is None:
-        return found, joint, gaps, parts
+        return now
     stages = {**found.stages, unknown.stage: learned.findings}
     placed = replace(unknown, term=replace(unknown.term, place=learned.place))
-    with_ = replace(found, stages=stages, unknown=placed, learned=learned)
-    with_, joint_with, gaps_with = _fit_and_measure(fitted, with_, progress)
-    if not gaps_with.after.total < gaps.after.total:
+    measured = _fit_and_measure(fitted, replace(found, stages=stages, unknown=placed, learned=learned), progress)
+    closer = _Measured(*measured, _parts(*measured, settings))
+    if not closer.closes_more(now, settings.material):
         effect_file.forget(learned.id)
-        return found, joint, gaps, parts
-    return with_, joint_with, gaps_with, _parts(with_, joint_with, gaps_with, settings)
+        return now
+    return closer
 
 
 def _without(found: _Findings, name: str) -> _Findings:
@@ -378,22 +406,28 @@ def _repeats(parts: Sequence[Part], material: float) -> bool:
     return gap_share.UNKNOWN in share and share[gap_share.UNKNOWN].value >= material
 
 
-def _approximated(unknown: UnknownEffect, joint: JointFit, gaps: _Gaps, parts: Sequence[Part]) -> bool:
-    """Whether effects found only approximate an unknown one whose part of the gap, theirs included, is the largest."""
-    effects = joint.findings[unknown.stage].effects
-    if not unknown.instead or not effects:
+def _may_approximate(now: _Measured) -> bool:
+    """Whether effects found may only approximate an unknown one whose part of the gap, theirs included, is largest."""
+    unknown = now.found.unknown
+    if unknown is None or not unknown.instead:
         return False
-    theirs = gap_share.part_of_several(effects, joint, gaps.held_out.in_motion(), unknown.term.place)
+    effects, parts = now.joint.findings[unknown.stage].effects, now.parts
+    if not effects:
+        return False
+    theirs = gap_share.part_of_several(effects, now.joint, now.gaps.held_out.in_motion(), unknown.term.place)
     names = {h.name for h in effects}
     rest = sum(p.amount for p in parts if p.name == gap_share.UNKNOWN)
     others = [p.amount for p in parts if p.name and p.name not in {*names, gap_share.UNKNOWN}]
     return theirs.amount + rest > max(others, default=0.0)
 
 
-def _closes_more(learned: Gap, known: _Gaps, parts: Sequence[Part], material: float) -> bool:
-    """Whether a learned term closes a material share more of the gap than the known effects that it is in place of."""
-    open_ = sum(max(p.amount, 0.0) for p in parts)
-    return gap_share.squared(known.after) - gap_share.squared(learned) > material * open_
+def _unknown_alone(fitted: CutChains, now: _Measured, settings: Settings, progress: Progress) -> _Measured:
+    """The same without the effects of the stage in which an unknown one is."""
+    assert now.found.unknown is not None
+    stage = now.found.unknown.stage
+    stages = {**now.found.stages, stage: now.found.stages[stage].nothing()}
+    measured = _fit_and_measure(fitted, replace(now.found, stages=stages), progress)
+    return _Measured(*measured, _parts(*measured, settings))
 
 
 def _find(fitted: CutChains, settings: Settings, progress: Progress) -> _Findings:

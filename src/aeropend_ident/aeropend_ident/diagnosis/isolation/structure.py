@@ -35,7 +35,7 @@ MODEL: Equations = MappingProxyType({
     "d angle/dt": frozenset({"rate", "angle"}),
     "d rate/dt": frozenset({"d_rate", "rate"}),
 })
-"""The equations of the chain (`actuator`, `motor`, `arm`), one a place, and the derivatives; current loads the supply."""
+"""The equations of the chain (in `model`), one a place, and the derivatives; current loads the supply."""
 
 READS = {"theta": "angle", "omega": "speed", "i_a": "current", "v_a": "voltage"}
 """The variable that each channel reads."""
