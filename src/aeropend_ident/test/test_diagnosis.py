@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from aeropend_ident.diagnosis import diagnosis
-from aeropend_ident.diagnosis.diagnosis import Settings, diagnose
+from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.free_run_gap import Gap
 from aeropend_ident.diagnosis.gap_share import Part
 from aeropend_ident.diagnosis.left_open import design_command
+from aeropend_ident.diagnosis.measured import Measured, Settings
 from aeropend_ident.diagnosis.results import document, verdict_lines
 from aeropend_ident.diagnosis.validation import validate
 from aeropend_ident.signals.signals import from_arrays
@@ -198,10 +199,10 @@ def test_the_most_harmful_effect_is_taken_out_alone_unless_the_gap_is_then_large
     def measured(_fitted, found, _progress):
         return found, None, SimpleNamespace(after=SimpleNamespace(total=totals[found]))
 
-    monkeypatch.setattr(diagnosis, "_parts", lambda found, *_: [
+    monkeypatch.setattr(diagnosis, "parts_of", lambda found, *_: [
         Part(name, "arm", amount, np.zeros(1)) for name, amount in amounts[found].items()])
     monkeypatch.setattr(diagnosis, "_without", lambda found, name: found - {name})
-    monkeypatch.setattr(diagnosis, "_fit_and_measure", measured)
+    monkeypatch.setattr(diagnosis, "fit_and_measure", measured)
     start = frozenset("abc")
     found, _, _, parts = diagnosis._without_harmful(None, start, None, measured(None, start, None)[2], Settings(), None)
     assert found == {"b", "c"}
@@ -217,7 +218,7 @@ def test_what_stays_open_is_unknown_though_the_joint_fit_closes_a_larger_misfit_
 def left(rms, floor, parts=()):
     """Findings that leave this gap above this floor."""
     gaps = SimpleNamespace(after=Gap({"theta": rms}, {"theta": 1.0}, np.full((1, 1), rms**2)), floors={"theta": floor})
-    return diagnosis._Measured(None, None, gaps, [Part(name, "arm", x, np.zeros(1)) for name, x in parts])
+    return Measured(None, None, gaps, [Part(name, "arm", x, np.zeros(1)) for name, x in parts])
 
 
 @pytest.mark.parametrize(("rms", "closes_more"), [(0.19, True), (0.199, False), (0.21, False)])

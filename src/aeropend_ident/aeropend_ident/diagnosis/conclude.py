@@ -9,58 +9,111 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aeropend_ident.diagnosis import experiment_design
+from aeropend_ident.diagnosis import experiment_design, gap_share, regions, since
 from aeropend_ident.diagnosis.chain import driven_rig
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import CHOSEN, OF_THE_ARM, UNCALIBRATED_SD, ZERO, basis, model_parameters
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, FILTER, STAGES, limits, neutral, of_rig, with_values
 from aeropend_ident.diagnosis.document import (
+    CANNOT_TELL,
     Candidate,
+    Channel,
+    Closure,
+    Conclusions,
+    Curve,
     EffectSet,
+    Formula,
     HangingAngle,
     Identified,
     Interval,
     NextExperiment,
     ParameterRow,
+    Residual,
     VariantFound,
+    Where,
+    Which,
+    interval,
 )
-from aeropend_ident.diagnosis.free_run_gap import HeldOut
+from aeropend_ident.diagnosis.document import UnknownEffect as DrawnEffect
+from aeropend_ident.diagnosis.experiment_design import EXPERIMENTS, experiments_within
+from aeropend_ident.diagnosis.free_run_gap import HeldOut, closure
 from aeropend_ident.diagnosis.joint_fit import WIDER, JointFit, run_to_run
-from aeropend_ident.diagnosis.policy import CALIBRATED, MATERIAL_SHARE, angle_only
+from aeropend_ident.diagnosis.measured import (
+    Gaps,
+    Measured,
+    Settings,
+    Statistical,
+    parts_of_effects,
+    parts_of_parameters,
+)
+from aeropend_ident.diagnosis.policy import CALIBRATED, GOOD_ENOUGH, MATERIAL_SHARE, angle_only
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis
+from aeropend_ident.diagnosis.search.formula_fit import fitted_formulas
+from aeropend_ident.diagnosis.search.free_curves import MissingTerm
+from aeropend_ident.diagnosis.search.learned_term import Learned
 from aeropend_ident.diagnosis.search.onset import Onset
 from aeropend_ident.diagnosis.search.search import refit
 from aeropend_ident.diagnosis.search.selection import FORM_SHOWS, mean_square, plausible, squared_gap
 from aeropend_ident.diagnosis.strength import Strengths
 from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter, key
-from aeropend_ident.signals.signals import Mounting, Signals
-from aeropend_ident.signals.statistics import Z95
+from aeropend_ident.signals.signals import CHANNELS, Mounting, Signals
+from aeropend_ident.signals.statistics import Z95, rms
 from aeropend_ident.signals.variants import SAME
-from aeropend_sim.model.effects import family
+from aeropend_sim.model.effects import DEFINED, family
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import DUTY_MAP, MODEL_NAMES, OPTIONAL, Model
+from aeropend_sim.wording import times
 
 DETERMINED = 0.5
 """Share of a prior's width above which the recordings have not determined a parameter (choice)."""
 
+FACTORS = {"": "", "thrust": " (share of the thrust)", "theta_dot": " (damping)", "i_a": " (resistance)"}
+"""What the values of a curve are that is multiplied by a quantity."""
 
-@dataclass(frozen=True)
-class Statistical:
-    """Effects that were detected by their statistics, not fitted.
 
-    Attributes:
-        gust: a random torque on the arm.
-        spikes: false captures of the speed.
-    """
-
-    gust: RankedHypothesis | None
-    spikes: RankedHypothesis | None
-
-    @property
-    def found(self) -> list[RankedHypothesis]:
-        """Those that were detected."""
-        return [e for e in (self.gust, self.spikes) if e is not None]
+def conclusions(now: Measured, settings: Settings) -> Conclusions:
+    """What the findings, the joint fit and the gaps show."""
+    found, joint, gaps, parts = now
+    chains, stages, unknown = found.chains, joint.findings, found.unknown
+    calibrated = chains.policy.calibrated
+    share = gap_share.shares(parts)
+    head = gap_share.headline(parts, share, settings.material)
+    failed = found.failed or _why_untried(stages, head.verdict) or _why_not_predicted(chains, gaps)
+    if head.verdict == "none" and not calibrated:
+        failed = failed or gap_share.why_unsure(share, settings.material)
+    if failed:
+        head = gap_share.Headline(CANNOT_TELL, "none", [], [], set())
+    listed = tuple(c for c in candidates(joint, found.statistical, gaps.held_out, gaps.after.total, head.claimed, share,
+                                         found.onset) if found.learned is None or c.effect != found.learned.id)
+    unlearned = {} if found.learned is None else {found.learned.without.stage: found.learned.without}
+    left = _left({**stages, **unlearned}, gust=found.statistical.gust is not None)
+    reasons = [f"{c} is off by {times(x)} a reading's noise" for c, x in left.items() if x > GOOD_ENOUGH]
+    reasons = [failed] if failed else reasons
+    drawn = None if unknown is None else _drawn(unknown.term, found.learned, joint, gaps, settings)
+    undecided = not_separable(chains, stages)
+    tried = EXPERIMENTS if calibrated else experiments_within(max(s.largest_duty for s in found.recordings))
+    rows = parameter_rows(chains, joint)
+    closed, low, high = closure(gaps.before, gaps.after, gaps.floors)
+    places = gap_share.share_of_places(parts, lambda: parts_of_parameters(joint, gaps))
+    return Conclusions(
+        channels={c: Channel(CHANNELS[c], gaps.before.rms[c], gaps.floors[c], gaps.after.rms[c], *gaps.fits(c))
+                  for c in CHANNELS if all(c in g.rms for g in (gaps.before, gaps.after, gaps.fitted))},
+        where=Where(head.place, regions.shares(places), tuple(regions.regions(found.misfit))),
+        which=Which(family(head.verdict), _families(head.effects), listed, rows,
+                    {channel: Residual(check.rms[channel], check.white[channel], check.dependence)
+                     for check in joint.checks.values() for channel in check.rms},
+                    tuple(reasons), drawn, tuple(names(a, b) for a, b in undecided),
+                    next_experiment(chains.model, found.recordings[0], undecided,
+                                    _unlearned(joint.values_of_rig, found.learned), tried, settings.jobs),
+                    _families(head.small), sets(stages)),
+        closure=Closure(gaps.before.total, gaps.after.total, gaps.before.total_floor(gaps.floors), closed, low, high,
+                        budget=gaps.budget(gust=found.statistical.gust is not None, jobs=settings.jobs)),
+        identified=None if calibrated else identified_model(chains, joint, rows),
+        variants=variants(chains, joint) or None,
+        since=None if chains.known is None else since.changes(
+            chains.known, joint, found.statistical, head.claimed),
+        estimates=None if failed else since.estimates(joint, found.statistical))
 
 
 def parameter_rows(chains: CutChains, joint: JointFit) -> dict[str, ParameterRow]:
@@ -343,6 +396,63 @@ def _finite(x: float) -> float | None:
     return x if math.isfinite(x) else None
 
 
-def interval(value: float, sd: float, low: float = -math.inf, high: float = math.inf) -> Interval:
-    """An estimate with its 95 % interval, which ends where the range of the value does."""
-    return Interval(value, max(value - Z95 * sd, low), min(value + Z95 * sd, high))
+def _unlearned(values: Mapping[str, float], learned: Learned | None) -> dict[str, float]:
+    """The values without those of a learned term: no experiment is designed for its many numbers."""
+    return {n: v for n, v in values.items() if learned is None or key(n).owner != learned.id}
+
+
+def _families(ids: Sequence[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(family(id_) for id_ in ids))
+
+
+def _why_untried(stages: Mapping[str, Findings], verdict: str) -> str:
+    """Why neither "none" nor "unknown" can be said: no effect of some stage was tried; "" if they were."""
+    untried = [stage for stage, f in stages.items() if f.cut_short and not f.found and not f.rivals]
+    if not untried or verdict not in ("none", gap_share.UNKNOWN):
+        return ""
+    return f"the time was up before any effect of the {' and of the '.join(untried)} was tried: give more --seconds"
+
+
+def _why_not_predicted(chains: CutChains, gaps: Gaps) -> str:
+    """Why a model that was identified predicts nothing that it was not fitted to; "" if it predicts something."""
+    if not chains.policy.wide_search or "theta" not in gaps.after.rms:
+        return ""
+    fitted, unseen = gaps.fits("theta")
+    if unseen >= 0.0:
+        return ""
+    return ("the model that was identified does not predict the rig: on the unseen part its free run is off by "
+            f"{times(1.0 - unseen)} as much as a constant angle, on the part that was fitted by {times(1.0 - fitted)}; "
+            "a longer recording whose last third repeats angles and duties of the part before helps most")
+
+
+def _drawn(term: MissingTerm, learned: Learned | None, joint: JointFit, gaps: Gaps, settings: Settings
+           ) -> DrawnEffect:
+    """The unknown effect by the curves of the term that was learned; by free curves if none was."""
+    if learned is None:
+        return DrawnEffect(term.place, tuple(
+            Curve(c.variable, c.unit, tuple(c.knot.tolist()), tuple(c.value.tolist())) for c in term.curves))
+    share = gap_share.shares(parts_of_effects(joint, gaps, settings))
+    curves = tuple(Curve(f"{c.form.of}{FACTORS[c.form.factor]}", c.form.value_unit, tuple(c.knot.tolist()),
+                         tuple(learned.values_of(c, joint.values))) for c in learned.curves)
+    fitted = fitted_formulas(gaps.held_out.chains, learned, joint.values, joint.sd, settings.jobs)
+    formulas = tuple(Formula(f.id, DEFINED[f.id].term, {n: p.default for n, p in DEFINED[f.id].parameters.items()},
+                             _gap_with(f.values, learned, joint, gaps)) for f in fitted)
+    return DrawnEffect(learned.place, curves, learned.id, share.get(learned.id), formulas)
+
+
+def _gap_with(values: Mapping[str, float], learned: Learned, joint: JointFit, gaps: Gaps) -> float | None:
+    """The gap with a formula in place of the learned term; None if the model diverges."""
+    others = {n: v for n, v in joint.values.items() if key(n).owner != learned.id}
+    after = gaps.held_out.gap_of({**others, **values}).total
+    return after if math.isfinite(after) else None
+
+
+def _left(findings: Mapping[str, Findings], *, gust: bool) -> dict[str, float]:
+    """Channel -> RMS of the residual that is left in its stage, in units of a reading's noise."""
+    left: dict[str, float] = {}
+    for stage, f in findings.items():
+        for channel, r in f.final.residuals.items():
+            if not (gust and stage == "arm"):
+                name = key(channel).name
+                left[name] = max(left.get(name, 0.0), rms(r))
+    return left

@@ -9,6 +9,7 @@ The field `closure` is the key "shrink", `basis` the key "from"; all other keys 
 from __future__ import annotations
 
 import json
+import math
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ from pathlib import Path
 from aeropend_ident.diagnosis import typed_json
 from aeropend_ident.diagnosis.typed_json import JsonError
 from aeropend_ident.signals.signals import Mounting
+from aeropend_ident.signals.statistics import Z95
 from aeropend_sim.errors import UserError
 
 CANNOT_TELL = "cannot_tell"
@@ -98,6 +100,11 @@ class Interval:
     value: float
     low: float
     high: float
+
+
+def interval(value: float, sd: float, low: float = -math.inf, high: float = math.inf) -> Interval:
+    """An estimate with its 95 % interval, which ends where the range of the value does."""
+    return Interval(value, max(value - Z95 * sd, low), min(value + Z95 * sd, high))
 
 
 @dataclass(frozen=True)

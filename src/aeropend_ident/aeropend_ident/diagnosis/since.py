@@ -15,9 +15,9 @@ from scipy.linalg import block_diag
 from aeropend_ident.diagnosis import document
 from aeropend_ident.diagnosis.chain.known import Known, is_parameter, pooled
 from aeropend_ident.diagnosis.chain.values import limits, neutral, with_values
-from aeropend_ident.diagnosis.conclude import Statistical, interval
-from aeropend_ident.diagnosis.document import Change, DiagnosisDocument, DocumentError, Estimates, Since
+from aeropend_ident.diagnosis.document import Change, DiagnosisDocument, DocumentError, Estimates, Since, interval
 from aeropend_ident.diagnosis.joint_fit import SURE, WIDER, JointFit
+from aeropend_ident.diagnosis.measured import Statistical
 from aeropend_ident.estimation.map_fit import covariance_of
 from aeropend_ident.estimation.parameter import key
 from aeropend_sim.model.effects import DEFINED
