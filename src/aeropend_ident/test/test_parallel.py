@@ -3,6 +3,8 @@
 
 import os
 import signal
+import time
+from multiprocessing import active_children
 
 import pytest
 
@@ -73,3 +75,11 @@ def test_where_ctrl_c_is_ignored_it_stays_so():
 def test_ctrl_c_ends_the_copies_too():
     with pytest.raises(KeyboardInterrupt):
         interrupted(lambda: parallel(2, lambda _: os.kill(os.getpid(), signal.SIGINT), range(2)))
+
+
+def test_ctrl_c_for_this_process_alone_ends_the_copies_at_once():
+    begun = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(lambda: parallel(2, lambda _: time.sleep(60.0), range(2)))
+    assert time.monotonic() - begun < 30.0
+    assert active_children() == []

@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The free run that simulates the motor, then the arm."""
 
+import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from aeropend_ident.diagnosis.chain.free_run import StagedRun, free_run
+from aeropend_ident.interrupt import interrupts_wait
 from aeropend_ident.testing.rigs import BENCH, recorded
 from aeropend_sim.model import dynamics
 
@@ -53,3 +55,15 @@ def test_the_motor_runs_again_only_for_its_own_values(signals, monkeypatch):
     run.readings({"R_a": 1.2})
     run.readings({"supply_sag.r_supply": 0.3})
     assert len(runs) == 3
+
+
+@pytest.mark.parametrize("simulate", [free_run, lambda model, signals: StagedRun(model, signals).readings({})])
+def test_ctrl_c_takes_effect_before_a_run(signals, simulate):
+    def interrupted():
+        with interrupts_wait():
+            signal.raise_signal(signal.SIGINT)
+            simulate(BENCH, signals)
+            pytest.fail("it was simulated")
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()

@@ -26,6 +26,7 @@ from aeropend_ident.diagnosis import document, typed_json
 from aeropend_ident.diagnosis.isolation.planned import PlanError, planned
 from aeropend_ident.diagnosis.left_open import Open, as_refitted, left_open
 from aeropend_ident.diagnosis.report.number_format import plain, plain_quantity
+from aeropend_ident.interrupt import interrupts_wait
 from aeropend_ident.result_folder import ensure_new, write_page
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import CHANNELS
@@ -86,10 +87,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             signals = planned(model, Excitation(duration=10.0).series(), options.channels or tuple(CHANNELS))
         effects = asked(model, further, sizes)
-        rows = Rows(model, signals, effects)
-        best = design(rows, _goal(options, rows, open_, list(effects)), limits,
-                      None if options.shortest else options.duration, tries=options.tries, seed=options.seed,
-                      jobs=options.jobs, progress=lambda what, share: show(share, what))
+        with interrupts_wait():
+            rows = Rows(model, signals, effects)
+            best = design(rows, _goal(options, rows, open_, list(effects)), limits,
+                          None if options.shortest else options.duration, tries=options.tries, seed=options.seed,
+                          jobs=options.jobs, progress=lambda what, share: show(share, what))
     command = shlex.join(["design", *arguments])
     excitation_file.save(best.excitation, out, f"Written by: {command}\n{'; '.join(reach_lines(best))}")
     if html is not None:

@@ -31,6 +31,7 @@ from aeropend_ident.diagnosis.diagnosis import Diagnosis
 from aeropend_ident.diagnosis.document import DiagnosisDocument
 from aeropend_ident.diagnosis.isolation.planned import planned
 from aeropend_ident.diagnosis.results import Results, document, verdict_lines
+from aeropend_ident.interrupt import interrupts_wait
 from aeropend_ident.result_folder import write_page
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import CHANNELS
@@ -90,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return document(found, bags, options.model, time.monotonic() - started)
 
     while True:
-        with progress("designing") as show:
+        with progress("designing") as show, interrupts_wait():
             proposal = inquiry.next(partial(_shown, show))
         if proposal is None:
             break
@@ -105,7 +106,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                        environment={**os.environ, "PYTHONUNBUFFERED": "1"}, console=console, namespace=ros[1:])
         bags.append(str(bag))
         with progress("reading") as show:
-            found = inquiry.add(signals_of(bag, None, model), diagnosed, partial(_shown, show))
+            read = signals_of(bag, None, model)
+            with interrupts_wait():
+                found = inquiry.add(read, diagnosed, partial(_shown, show))
         results = Results.of(found, diagnosed(found), command)
         print("\n".join(map(printable, verdict_lines(results.document, advice=False))), flush=True)
     if results is not None:

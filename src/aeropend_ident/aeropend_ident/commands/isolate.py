@@ -24,6 +24,7 @@ from aeropend_ident.diagnosis.isolation.isolate import Isolation, Sensor, isolat
 from aeropend_ident.diagnosis.isolation.planned import PlanError, like, planned
 from aeropend_ident.diagnosis.report import isolation as page
 from aeropend_ident.diagnosis.report.number_format import plain_quantity
+from aeropend_ident.interrupt import interrupts_wait
 from aeropend_ident.result_folder import ensure_new, write_page
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import CHANNELS
@@ -78,9 +79,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             recorded = partial(planned, model, _signal(options).series())
             channels = options.channels or list(CHANNELS)
-        found = isolate(model, recorded, channels, further, sizes, forms=options.forms,
-                        sensors=not options.no_sensors, jobs=options.jobs,
-                        progress=lambda what, share: show(share, what))
+        with interrupts_wait():
+            found = isolate(model, recorded, channels, further, sizes, forms=options.forms,
+                            sensors=not options.no_sensors, jobs=options.jobs,
+                            progress=lambda what, share: show(share, what))
     if html is not None:
         write_page(html, page.render(found, shlex.join(["isolate", *arguments])))
     if options.json:

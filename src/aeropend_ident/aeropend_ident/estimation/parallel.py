@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import FIRST_EXCEPTION, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from typing import Any, TypeVar
 
 from aeropend_ident.interrupt import check
@@ -19,6 +19,9 @@ from aeropend_sim.errors import UserError
 
 T = TypeVar("T")
 R = TypeVar("R")
+
+LOOK = 0.1
+"""[s] Time after which it is looked whether Ctrl-C waits. Choice: nobody notices it."""
 
 _work: list[tuple[Callable[[Any], Any], Sequence[Any]]] = []
 """The function and what it is called with, in a copy; empty in the process that is copied."""
@@ -41,10 +44,25 @@ def parallel(jobs: int, function: Callable[[T], R], items: Sequence[T]) -> list[
         return [function(item) for item in items]
     try:
         with ProcessPoolExecutor(min(jobs, len(items)), get_context("fork"), _begin, (function, items)) as pool:
-            return list(pool.map(_result, range(len(items))))
+            try:
+                return _results([pool.submit(_result, k) for k in range(len(items))])
+            finally:
+                pool.shutdown(cancel_futures=True)
     except BrokenProcessPool:
         check()  # Ctrl-C ends the copies too
         raise UserError("the system ended a process of the search, probably for want of memory: try --jobs 1") from None
+
+
+def _results(waiting: list[Future[R]]) -> list[R]:
+    """The results of calls that have begun; Ctrl-C ends the copies."""
+    try:
+        while wait(waiting, LOOK, FIRST_EXCEPTION).not_done and not any(f.done() and f.exception() for f in waiting):
+            check()
+        return [f.result() for f in waiting]
+    except KeyboardInterrupt:
+        for copy in active_children():
+            copy.kill()
+        raise
 
 
 def _begin(function: Callable[[Any], Any], items: Sequence[Any]) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.values import acts_on_motor, with_values, without_effects
+from aeropend_ident.interrupt import check
 from aeropend_ident.signals.pulses import mean_speed
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import actuator, dynamics, sensing
@@ -67,6 +68,7 @@ class StagedRun:
 
     def readings(self, values: Values) -> dict[str, Array]:
         """As `free_run`, with these values."""
+        check()
         s, pieces = self.signals, _pieces(self.model, self.signals, values)
         motor = self._motor(tuple((name, x) for name, x in values.items() if acts_on_motor(name)))
         state = _begin(pieces, values)
@@ -125,6 +127,7 @@ def _voltages(signals: Signals, piece: slice, m: Model) -> tuple[Array, Array]:
 
 def _run(signals: Signals, pieces: Pieces, values: Values) -> dynamics.Trajectory:
     """The run of the whole chain, piece by piece; see `dynamics.simulate`."""
+    check()
     out, state = np.empty((7, len(signals))), _begin(pieces, values)
     for piece, m in pieces:
         v, sampled = _voltages(signals, piece, m)
