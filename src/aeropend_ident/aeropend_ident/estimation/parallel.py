@@ -42,10 +42,15 @@ def parallel(jobs: int, function: Callable[[T], R], items: Sequence[T]) -> list[
     """
     if min(jobs, len(items)) < 2 or _work:
         return [function(item) for item in items]
+    others = {*active_children()}
     try:
         with ProcessPoolExecutor(min(jobs, len(items)), get_context("fork"), _begin, (function, items)) as pool:
             try:
                 return _results([pool.submit(_result, k) for k in range(len(items))])
+            except KeyboardInterrupt:
+                for copy in {*active_children()} - others:
+                    copy.kill()
+                raise
             finally:
                 pool.shutdown(cancel_futures=True)
     except BrokenProcessPool:
@@ -54,15 +59,10 @@ def parallel(jobs: int, function: Callable[[T], R], items: Sequence[T]) -> list[
 
 
 def _results(waiting: list[Future[R]]) -> list[R]:
-    """The results of calls that have begun; Ctrl-C ends the copies."""
-    try:
-        while wait(waiting, LOOK, FIRST_EXCEPTION).not_done and not any(f.done() and f.exception() for f in waiting):
-            check()
-        return [f.result() for f in waiting]
-    except KeyboardInterrupt:
-        for copy in active_children():
-            copy.kill()
-        raise
+    """The results of calls that have begun, or the first error."""
+    while wait(waiting, LOOK, FIRST_EXCEPTION).not_done and not any(f.done() and f.exception() for f in waiting):
+        check()
+    return [f.result() for f in waiting]
 
 
 def _begin(function: Callable[[Any], Any], items: Sequence[Any]) -> None:
