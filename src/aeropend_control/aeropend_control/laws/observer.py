@@ -201,7 +201,7 @@ def _observe(theta: float, volts: Array, s: State, m: sensing.Memory, gain: Arra
         error = theta - m.stage2
         y, rate = s.theta + gain[0] * error, s.theta_dot + gain[1] * error
         s = State(s.i_a, s.omega, s.rotor_angle, y, rate, s.thrust, s.heat, s.flex, s.flex_dot,
-                           s.gust + gain[2] * error, s.time, s.memory)
+                  s.gust + gain[2] * error, s.time, s.memory)
         m = sensing.Memory(m.stage1 + gain[3] * error, m.stage2 + gain[4] * error, y, rate, m.omega, m.rotor_angle,
                            m.last_pulse, m.speed, m.time)
     scratch, silent = np.empty((7, len(volts))), np.zeros(len(volts))
@@ -255,7 +255,7 @@ def _correct_motor(omega: float, i_a: float, s: State, m: MotorCorrection, angle
         share = -math.expm1(-time / SPEED_TIME)
         voltage = min(max(voltage + share * error / per_volt, -LARGEST_BIAS), LARGEST_BIAS)
         s = State(s.i_a, max(s.omega + share * error, 0.0), s.rotor_angle, s.theta, s.theta_dot, s.thrust,
-                           s.heat, s.flex, s.flex_dot, s.gust, s.time, s.memory)
+                  s.heat, s.flex, s.flex_dot, s.gust, s.time, s.memory)
     return s, MotorCorrection(voltage, current, read, at_pulse, outliers, k + 1)
 
 

@@ -272,12 +272,12 @@ def _arm(theta: Array, speed: Array, gains: Array, helped: NDArray[np.bool_], st
             rise = (speed[k + 1] - w) / c[j].steps
             for _ in range(c[j].steps):
                 now = State(0.0, w, 0.0, s.theta, s.theta_dot, s.thrust, 0.0, s.flex, s.flex_dot,
-                                     torque if helped[j] else 0.0, s.time, s.memory)
+                            torque if helped[j] else 0.0, s.time, s.memory)
                 past = None if added is None else dynamics.pasts(now, 0.0, c[j], added)
                 m, f1 = advance_arm(now, w + 0.5 * rise, w + rise, past, c[j], e[j], x[j], added)
                 w += rise
                 after = State(0.0, w, 0.0, m.theta, m.theta_dot, f1, 0.0, m.flex, m.flex_dot, 0.0, now.time,
-                                       now.memory)
+                              now.memory)
                 if added is not None and past is not None:
                     after = since(after, dynamics.past_after(now, after, 0.0, past, c[j], added))
                 s = after
@@ -288,8 +288,8 @@ def _arm(theta: Array, speed: Array, gains: Array, helped: NDArray[np.bool_], st
             if math.isnan(error):
                 error = 0.0
             states[j] = State(0.0, s.omega, 0.0, s.theta + gains[0] * error, s.theta_dot + gains[1] * error,
-                                       s.thrust, 0.0, s.flex, s.flex_dot, torque + gains[2] * error if j == 1 else 0.0,
-                                       s.time, s.memory)
+                              s.thrust, 0.0, s.flex, s.flex_dot, torque + gains[2] * error if j == 1 else 0.0,
+                              s.time, s.memory)
             stages[j, 0], stages[j, 1] = first + gains[0] * error, second + gains[0] * error
 
 

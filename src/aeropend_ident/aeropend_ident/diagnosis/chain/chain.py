@@ -235,8 +235,8 @@ class CutChain:
         else:
             speed = self.speed[:stop] if cut else s.turning(self.motor(values, stop)[1])
         state = State(omega=float(speed[0]), theta=values.get("initial.theta", 0.0),
-                               theta_dot=values.get("initial.theta_dot", 0.0),
-                               thrust=float(actuator.thrust(n, speed[0])))
+                      theta_dot=values.get("initial.theta_dot", 0.0),
+                      thrust=float(actuator.thrust(n, speed[0])))
         theta, rate = np.empty(len(speed)), np.empty(len(speed))
         for piece, m in self.pieces(values, stop):
             theta[piece], rate[piece], state = dynamics.swing(m, speed[piece], state, s.period)

@@ -114,8 +114,8 @@ def _begin(pieces: Pieces, values: Values) -> State:
     """The state at the first sample."""
     n, omega = pieces[0][1].numbers(), values.get("initial.omega", 0.0)
     return State(i_a=float(actuator.current_at(n, omega)), omega=omega,
-                          theta=values.get("initial.theta", 0.0), theta_dot=values.get("initial.theta_dot", 0.0),
-                          thrust=float(actuator.thrust(n, omega)))
+                 theta=values.get("initial.theta", 0.0), theta_dot=values.get("initial.theta_dot", 0.0),
+                 thrust=float(actuator.thrust(n, omega)))
 
 
 def _voltages(signals: Signals, piece: slice, m: Model) -> tuple[Array, Array]:
