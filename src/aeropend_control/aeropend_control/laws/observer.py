@@ -184,12 +184,8 @@ class Observer:
     def _voltage(self, duty: float) -> float:
         """[V] Voltage, without sag, in the sample period in which this duty begins to act."""
         before, self._duty = self._duty, duty
-        time, effects = (self.count + self._whole) * self.period, self.model.effects
-        v = float(actuator.at_bridge(actuator.mapped(duty, self._duty_map), time, effects))
-        if self._share == 0.0:
-            return v
-        first = float(actuator.at_bridge(actuator.mapped(before, self._duty_map), time, effects))
-        return float(actuator.acting(first, v, self._share))
+        time = (self.count + self._whole) * self.period
+        return float(actuator.held_voltage(self._duty_map, duty, before, self._share, time, self.model.effects))
 
 
 @njit(nogil=True)

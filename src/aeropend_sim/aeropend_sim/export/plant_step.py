@@ -117,10 +117,7 @@ def held_voltage(rig: Rig, duty: float, before: float, k: Known) -> float:
         before: duty that acts until a delayed change within the period; else without effect.
         k: the model.
     """
-    v = voltage_at(duty, rig, k)
-    if k.share > 0.0:
-        v = actuator.acting(voltage_at(before, rig, k), v, k.share)  # type: ignore[assignment]
-    return v
+    return actuator.held_voltage(k.duty_map, duty, before, k.share, rig.samples * k.period, k.effects)
 
 
 def next_sample(rig: Rig, duty: float, before: float, noise: float, k: Known) -> Rig:

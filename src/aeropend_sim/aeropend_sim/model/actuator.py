@@ -21,8 +21,6 @@ from aeropend_sim.model.terms import series
 
 Array = NDArray[np.float64]
 Numbers = Mapping[str, float]
-
-
 ScalarOrArray = TypeVar("ScalarOrArray", float, Array)
 
 
@@ -135,6 +133,24 @@ def voltages(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, f
 def acting(first: ArrayLike, then: ArrayLike, share: float) -> Array:
     """Voltage (V) that drives the winding to the same current as one voltage, and another one after it."""
     return np.asarray(share * np.asarray(first) + (1.0 - share) * np.asarray(then))
+
+
+def held_voltage(m: DutyMap, duty: float, before: float, share: float, time: float,
+                 effects: Mapping[str, Mapping[str, float]]) -> float:
+    """Voltage (V) at the bridge over one hold: `acting_voltage` of a single duty.
+
+    Args:
+        m: map from duty to voltage.
+        duty: that acts, from a delayed change within the hold on.
+        before: duty that acts until then; without effect if there is no such change.
+        share: weight of `before` (`share_of_first`); 0 without such a change.
+        time: [s] since the start of `supply_drift`.
+        effects: the active effects.
+    """
+    v = at_bridge(mapped(duty, m), time, effects)
+    if share > 0.0:
+        v = acting(at_bridge(mapped(before, m), time, effects), v, share)
+    return v  # type: ignore[return-value]
 
 
 def share_of_first(numbers: Numbers, part: float, period: float) -> float:

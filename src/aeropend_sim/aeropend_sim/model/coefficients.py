@@ -182,7 +182,7 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0, *, full
 
 
 def prepared(n: Mapping[str, float], e: Values | None, added: Terms | None, period: float, steps: int
-              ) -> tuple[Coefficients, Values | None, Extra | None, Terms | None]:
+             ) -> tuple[Coefficients, Values | None, Extra | None, Terms | None]:
     """As `prepare`, from the parts of a model and the number of steps."""
     h = period / steps
     resistance = n["R_a"] + (e.supply_sag_r_supply if e else 0.0)
