@@ -46,6 +46,7 @@ from aeropend_ident.diagnosis.measured import (
     Settings,
     Statistical,
     fit_and_measure,
+    measured,
     parts_of,
 )
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE, angle_only, policy_of
@@ -147,7 +148,6 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
 def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diagnosis:
     """The steps after the chain is cut; `fitted`: the chains whose training part parameters are fitted to."""
     found = _find(fitted, settings, progress)
-    progress("fitting all jointly", 0.75)
     found, joint, gaps = fit_and_measure(fitted, found, progress)
     if found.unknown is None and _changes_later(gaps):  # an unknown effect may show elsewhere in what follows
         return _diagnose(_fitted_further(fitted), settings, progress)
@@ -238,8 +238,7 @@ def _with_learned_term(fitted: CutChains, now: Measured, settings: Settings, pro
         return now
     stages = {**found.stages, unknown.stage: learned.findings}
     placed = replace(unknown, term=replace(unknown.term, place=learned.place))
-    measured = fit_and_measure(fitted, replace(found, stages=stages, unknown=placed, learned=learned), progress)
-    closer = Measured(*measured, parts_of(*measured, settings))
+    closer = measured(fitted, replace(found, stages=stages, unknown=placed, learned=learned), settings, progress)
     if not closer.closes_more(now, settings.material):
         effect_file.forget(learned.id)
         return now
@@ -285,8 +284,7 @@ def _unknown_alone(fitted: CutChains, now: Measured, settings: Settings, progres
     assert now.found.unknown is not None
     stage = now.found.unknown.stage
     stages = {**now.found.stages, stage: now.found.stages[stage].nothing()}
-    measured = fit_and_measure(fitted, replace(now.found, stages=stages), progress)
-    return Measured(*measured, parts_of(*measured, settings))
+    return measured(fitted, replace(now.found, stages=stages), settings, progress)
 
 
 def _find(fitted: CutChains, settings: Settings, progress: Progress) -> Found:
@@ -300,7 +298,7 @@ def _find(fitted: CutChains, settings: Settings, progress: Progress) -> Found:
             left = fit_own(with_values(fitted.model, fitted.likely), recordings).residuals
         if failed := static_map.why_not_identified(recordings, left):
             return Found(fitted, stages, Statistical(None, None), None, regions.largest_misfit(fitted, stages),
-                             recordings, failed)
+                         recordings, failed)
     if not fitted.policy.driven:  # a decay has few swings: effects are selected on all of them
         chains = CutChains(fitted.model, [replace(s, train=len(s)) for s in recordings], fitted.policy)
         chains.further, chains.left_out = fitted.further, fitted.left_out
@@ -326,7 +324,7 @@ def _find(fitted: CutChains, settings: Settings, progress: Progress) -> Found:
     stages = {**stages, "arm": detected.arm}
     misfit = regions.largest_misfit(chains, stages)
     return _judged(Found(chains, stages, Statistical(detected.gust, spikes), None, misfit, recordings,
-                             onset=begun))
+                         onset=begun))
 
 
 def _judged(found: Found, closed: Collection[str] = ()) -> Found:

@@ -175,6 +175,12 @@ def fit_and_measure(fitted: CutChains, found: Found, progress: Progress) -> tupl
     return found, joint, _measure(fitted, found, joint)
 
 
+def measured(fitted: CutChains, found: Found, settings: Settings, progress: Progress) -> Measured:
+    """As `fit_and_measure`, with the parts of the gap."""
+    found, joint, gaps = fit_and_measure(fitted, found, progress)
+    return Measured(found, joint, gaps, parts_of(found, joint, gaps, settings))
+
+
 def _measure(fitted: CutChains, found: Found, joint: JointFit) -> Gaps:
     """The gap on held-out data before and after."""
     chains, model = found.chains, found.chains.model
