@@ -60,8 +60,10 @@ def parallel(jobs: int, function: Callable[[T], R], items: Sequence[T]) -> list[
 
 def _results(waiting: list[Future[R]]) -> list[R]:
     """The results of calls that have begun, or the first error."""
-    while wait(waiting, LOOK, FIRST_EXCEPTION).not_done and not any(f.done() and f.exception() for f in waiting):
+    done, left = wait(waiting, 0.0)
+    while left and not any(f.exception() for f in done):
         check()
+        done, left = wait(waiting, LOOK, FIRST_EXCEPTION)
     return [f.result() for f in waiting]
 
 
