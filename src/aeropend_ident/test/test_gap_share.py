@@ -40,6 +40,18 @@ def test_an_uncertain_size_and_a_gap_that_varies_widen_the_interval():
     assert 0.1 < widths[2] < 1.0
 
 
+def test_an_effect_whose_form_may_be_another_is_surely_there():
+    """That its size has another meaning widens its share's interval; it does not make the effect absent."""
+    other_form, noisy = part("current_gain", 2.0, unsure=0.05), part("current_gain", 2.0, unsure=1.0)
+    other_form = replace(other_form, form=1.0)
+    beside = part("supply_drift", 1.0, unsure=0.05)
+    parts = [other_form, beside]
+    assert shares(parts)["current_gain"].low == 0.0
+    assert headline(parts, shares(parts), 0.03).verdict == "current_gain"
+    parts = [noisy, beside]
+    assert headline(parts, shares(parts), 0.03).verdict == "supply_drift"
+
+
 def test_effects_that_stand_in_for_each_other_have_parts_that_add_up_to_what_they_close_together():
     alike = [part("quadratic_drag", 0.5), part("coulomb_friction", 1.5), part("gust", -0.1)]
     assert [p.amount for p in gap_share._adding_up(alike, 4.0)] == pytest.approx([1.0, 3.0, -0.1])
@@ -62,14 +74,14 @@ def test_what_another_effect_could_close_is_not_claimed():
 class Fitted:
     """A joint fit and its gaps: squared gap by the effects that are left out, whether the others are fitted again."""
 
-    model = None
-
     def __init__(self, stages, fixed, again):
         self.findings = {f"stage {k}": SimpleNamespace(effects=effects) for k, effects in enumerate(stages)}
         self.chains, self.fixed, self.again = SimpleNamespace(known=None), fixed, again
-        sizes = [p.name for effects in stages for h in effects for p in h.own]
-        self.values, self.sd = dict.fromkeys(sizes, 1.0), dict.fromkeys(sizes, 0.1)
-        self.before = 2.0
+        self.values = {p.name: 1.0 for effects in stages for h in effects for p in h.own}
+        self.forms, self.before = dict[str, float](), 2.0
+
+    def unsure(self, effect, form):
+        return 0.1
 
     def fit_without(self, wanted, jobs=1):
         pass
@@ -85,8 +97,7 @@ class Fitted:
     def floors(self):
         return {"theta": 0.0}
 
-    def parts(self, monkeypatch):
-        monkeypatch.setattr(gap_share, "neutral", lambda model, name: 0.0)
+    def parts(self):
         return {p.name: p for p in gap_share.parts_of_effects(self, self, self.gap_of(self.before), 0.03)}
 
 
@@ -94,31 +105,31 @@ def effect(name):
     return SimpleNamespace(name=name, place="arm", own=[SimpleNamespace(name=f"{name}.size")])
 
 
-def test_one_of_two_effects_that_stand_in_for_each_other_is_unique(monkeypatch):
+def test_one_of_two_effects_that_stand_in_for_each_other_is_unique():
     a, b, c = effect("a"), effect("b"), effect("c")
     fixed = {"": 0.1, "a": 0.5, "b": 0.7, "c": 0.2, "bc": 0.9, "ac": 0.6, "ab": 0.8, "abc": 1.0}
-    parts = Fitted([[a, b, c]], fixed, {"a": 0.11, "b": 0.12, "c": 0.2, "ab": 0.6}).parts(monkeypatch)
+    parts = Fitted([[a, b, c]], fixed, {"a": 0.11, "b": 0.12, "c": 0.2, "ab": 0.6}).parts()
     assert [parts[n].unique for n in "abc"] == pytest.approx([0.01, 0.49, 0.1])
     head = headline(list(parts.values()), shares(list(parts.values())), 0.03)
     assert set(head.effects) == {"b", "c"}
     assert head.small == ["a"]
 
 
-def test_effects_that_cancel_each_other_have_the_parts_of_others_fitted_again(monkeypatch):
+def test_effects_that_cancel_each_other_have_the_parts_of_others_fitted_again():
     a, b, c = effect("a"), effect("b"), effect("c")
     fixed = {"": 0.1, "a": 8.0, "b": 15.0, "c": 0.2, "bc": 9.0, "ac": 14.0, "ab": 0.9, "abc": 1.0}
-    parts = Fitted([[a, b, c]], fixed, {"a": 1.2, "b": 0.12, "c": 0.2, "bc": 0.2, "ac": 1.1}).parts(monkeypatch)
+    parts = Fitted([[a, b, c]], fixed, {"a": 1.2, "b": 0.12, "c": 0.2, "bc": 0.2, "ac": 1.1}).parts()
     scale = 0.9 / (0.95 + 0.1)
     assert [parts[n].amount for n in "abc"] == pytest.approx([scale * 0.95, -0.04, scale * 0.1])
     assert parts["a"].ends == pytest.approx((0.8, 1.1))
 
 
-def test_an_effect_closes_no_more_than_the_nominal_model_leaves(monkeypatch):
+def test_an_effect_closes_no_more_than_the_nominal_model_leaves():
     fitted = Fitted([[effect("a")]], {"": 0.1, "a": 0.5}, {})
-    assert fitted.parts(monkeypatch)["a"].amount == pytest.approx(0.4)
+    assert fitted.parts()["a"].amount == pytest.approx(0.4)
     fitted.before = 0.09
-    assert fitted.parts(monkeypatch)["a"].amount == pytest.approx(-0.01)
-    assert fitted.parts(monkeypatch)["a"].unique == pytest.approx(-0.01)
+    assert fitted.parts()["a"].amount == pytest.approx(-0.01)
+    assert fitted.parts()["a"].unique == pytest.approx(-0.01)
 
 
 def test_an_effect_whose_size_may_be_nothing_is_no_claim():

@@ -164,3 +164,20 @@ def test_a_covariance_has_variances_above_0_however_near_to_singular_its_informa
     near[0, 1] = near[1, 0] = near[0, 1] * (1.0 + 1e-9)
     assert (np.diag(np.linalg.inv(near)) < 0.0).any()
     assert (np.diag(covariance_of(near)) > 0.0).all()
+
+
+def test_a_size_is_surer_while_the_phase_with_which_it_trades_is_held():
+    """Over a small angle a sine is nearly a straight line: amplitude and phase make the same slope together."""
+    x, noise = np.linspace(-0.2, 0.2, len(T)), 0.003 * np.random.default_rng(5).standard_normal(len(T))
+    y = 0.05 * np.sin(x + 0.8) + noise
+    amplitude, offset = Parameter("amplitude", 0.04, 0.1, low=0.0), Parameter("offset", 0.0, 0.05)
+    phase = Parameter("phase", 0.5, 1.0)
+
+    def residuals(values):
+        return {"y": (y - values["offset"] - values["amplitude"] * np.sin(x + values.get("phase", 0.8))) / 0.003}
+
+    both = fit(residuals, [amplitude, phase, offset])
+    held = fit(lambda values: residuals({**values, "phase": both.values["phase"]}), [amplitude, offset])
+    assert both.sd_given("amplitude", ["phase"]) == pytest.approx(held.sd["amplitude"], rel=0.02)
+    assert both.sd["amplitude"] > 3.0 * held.sd["amplitude"]
+    assert both.sd_given("amplitude", []) == pytest.approx(both.sd["amplitude"])

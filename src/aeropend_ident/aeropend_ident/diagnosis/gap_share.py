@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis.chain.values import PLACE_OF_CHANNEL, neutral
+from aeropend_ident.diagnosis.chain.values import PLACE_OF_CHANNEL
 from aeropend_ident.diagnosis.document import Interval
 from aeropend_ident.diagnosis.free_run_gap import RESAMPLES, Gap, HeldOut
 from aeropend_ident.diagnosis.joint_fit import JointFit
@@ -56,7 +56,8 @@ class Part:
         place: of the chain.
         amount: squared gap, in units of the spread squared.
         windows: (W,) the same over each window of the bootstrap.
-        unsure: relative standard deviation of the size of the effect.
+        unsure: relative standard deviation of the size of the effect by noise, its other parameters held.
+        form: relative error of the size, since the true form of the effect may be another.
         ends: least and most that it may be, as effects stand in for each other.
         unique: what comes back without it although the other effects are fitted again: no other effect closes that.
     """
@@ -66,6 +67,7 @@ class Part:
     amount: float
     windows: Array
     unsure: float = 0.0
+    form: float = 0.0
     ends: tuple[float, float] = (math.inf, -math.inf)
     unique: float = math.inf
 
@@ -111,6 +113,7 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, before: Gap, material: 
         jobs: processes.
     """
     stages = [f.effects for f in joint.findings.values() if f.effects]
+    form_of = {h.name: joint.forms.get(stage, 0.0) for stage, f in joint.findings.items() for h in f.effects}
     if not stages:
         return []
     after = held_out.gap_of(joint.values)
@@ -129,9 +132,8 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, before: Gap, material: 
     again = {h.name: gap(every) if len(every) == 1 else held_out.gap_of(joint.without([h], others=True)) for h in tried}
 
     def part(effect: Hypothesis, effects: Sequence[Hypothesis]) -> Part:
-        size = effect.own[0].name
-        distance = abs(joint.values[size] - neutral(held_out.model, size))
-        unsure = min(joint.sd[size] / max(distance, 1e-300), LARGEST_UNSURE)
+        form = form_of[effect.name]
+        unsure = min(joint.unsure(effect, form), LARGEST_UNSURE)
         last, first, alone = (_coming_back(effect.name, effect.place, gap(without), gap(with_), unsure)
                               for without, with_ in (([effect], []), (effects, _but(effects, effect)),
                                                      (every, _but(every, effect))))
@@ -144,7 +146,7 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, before: Gap, material: 
                 first = _coming_back(effect.name, effect.place, gap(effects), with_, unsure)
         amounts = [p.amount for p in (last, first, alone)]
         return replace(last, amount=0.5 * (last.amount + first.amount), windows=0.5 * (last.windows + first.windows),
-                       ends=(min(amounts), max(amounts)), unique=unique)
+                       form=form, ends=(min(amounts), max(amounts)), unique=unique)
 
     parts = [p for effects in stages for p in _adding_up(
         [part(h, effects) for h in effects], squared(gap(effects)) - squared(after))]
@@ -250,7 +252,8 @@ def part_of_spikes(spikes: RankedHypothesis, with_: Gap, without: Gap) -> Part:
     return replace(part, amount=max(part.amount, 0.0))
 
 
-def shares(parts: Sequence[Part], *, shared: float = SHARED, ends: bool = True, seed: int = 0) -> dict[str, Interval]:
+def shares(parts: Sequence[Part], *, shared: float = SHARED, forms: bool = True, ends: bool = True, seed: int = 0
+           ) -> dict[str, Interval]:
     """Name -> share of the gap, with a 95 % interval.
 
     The interval holds the scatter over time (block bootstrap, H. Künsch, 1989) and the uncertainty of the size. It also
@@ -261,6 +264,7 @@ def shares(parts: Sequence[Part], *, shared: float = SHARED, ends: bool = True, 
     Args:
         parts: of the gap.
         shared: as `SHARED`; 0 leaves out what is unexplained.
+        forms: whether the true form of an effect may be another.
         ends: whether the intervals reach to the ends of the parts.
         seed: of the bootstrap.
     """
@@ -273,7 +277,8 @@ def shares(parts: Sequence[Part], *, shared: float = SHARED, ends: bool = True, 
     blocks = min(len(p.windows) for p in parts)
     picks = rng.integers(0, blocks, (RESAMPLES, blocks)) if blocks > 1 else np.zeros((RESAMPLES, 1), dtype=np.intp)
     # a size of the other sign closes nothing
-    size = [np.maximum(1.0 + p.unsure * rng.standard_normal(RESAMPLES), 0.0) for p in parts]
+    unsure = [math.hypot(p.unsure, p.form if forms else 0.0) for p in parts]
+    size = [np.maximum(1.0 + x * rng.standard_normal(RESAMPLES), 0.0) for x in unsure]
     drawn = np.array([p.windows[picks].mean(axis=1) * x**2 for p, x in zip(parts, size, strict=True)])
     drawn /= np.maximum(np.maximum(drawn, 0.0).sum(axis=0), total * LEAST_DRAWN)
     rest = np.sqrt(sum((np.maximum(d, 0.0) for p, d in zip(parts, drawn, strict=True) if p.name in ("", UNKNOWN)),
@@ -310,7 +315,7 @@ def headline(parts: Sequence[Part], share: Mapping[str, Interval], material: flo
             be there.
     """
     named = sorted((p for p in parts if p.name), key=lambda p: -p.amount)
-    scatter = shares(parts, shared=0.0, ends=False)
+    scatter = shares(parts, shared=0.0, forms=False, ends=False)  # an effect of another form is there too
     likely = [p for p in named if p.name in share and share[p.name].value >= material
               and (p.name == UNKNOWN or scatter[p.name].low > 0.0)]
     least = material * whole(parts)

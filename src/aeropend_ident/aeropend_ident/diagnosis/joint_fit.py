@@ -85,6 +85,7 @@ class JointFit:
         values: name -> estimate.
         sd: name -> standard deviation, with the uncertainty from the form of an effect.
         checks: stage -> tests of what is left of it.
+        forms: stage -> relative error of the size of an effect, since its true form may be another.
         alone: name -> estimate and standard deviation of each of several calibrated recordings, fitted alone.
     """
 
@@ -94,6 +95,7 @@ class JointFit:
     values: dict[str, float]
     sd: dict[str, float]
     checks: dict[str, Check]
+    forms: dict[str, float] = field(default_factory=dict)
     alone: dict[str, tuple[Estimate, ...]] = field(default_factory=dict)
     _fitted_without: dict[tuple[frozenset[str], bool], dict[str, float]] = field(default_factory=dict, repr=False)
 
@@ -198,6 +200,18 @@ class JointFit:
         ends = (p.mean - TOLERANCE * p.sd, p.mean + TOLERANCE * p.sd, *also)
         return replace(p, low=max(p.low, min(ends)), high=min(p.high, max(ends)))
 
+    def unsure(self, effect: Hypothesis, form: float) -> float:
+        """Relative standard deviation of the size of an effect by noise alone; see `size_sd`.
+
+        Args:
+            effect: that was found.
+            form: what `forms` has for its stage.
+        """
+        size = effect.own[0].name
+        distance = abs(self.values[size] - neutral(self.chains.model, size))
+        by_noise = math.sqrt(max(self.sd[size] ** 2 - (form * distance) ** 2, 0.0))
+        return size_sd(effect, self.fit, {size: by_noise}) / max(distance, 1e-300)
+
     def expected_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         """The values without some of the effects if the readings were linear in all of them."""
         every = self.parameters
@@ -211,6 +225,22 @@ class JointFit:
         z[kept] -= np.linalg.solve(information[np.ix_(kept, kept)], information[np.ix_(kept, gone)] @ moved)
         z[gone] += moved
         return {n: min(max(every[n].value(x), every[n].low), every[n].high) for n, x in zip(names, z, strict=True)}
+
+
+def size_sd(effect: Hypothesis, joint: Fit, sd: Mapping[str, float]) -> float:
+    """Standard deviation of the size of an effect, with its other parameters held.
+
+    It says how surely the effect is there. Without its size it is absent, whatever its other parameters are: that a
+    phase or a width trades with the size widens the interval of the size alone.
+
+    Args:
+        effect: that was fitted.
+        joint: the joint fit.
+        sd: name -> standard deviation, wider than that of the fit.
+    """
+    size, *others = (p.name for p in effect.own)
+    traded = WIDER**2 * (joint.sd[size] ** 2 - joint.sd_given(size, others) ** 2)
+    return math.sqrt(max(sd[size] ** 2 - traded, 0.0))
 
 
 def run_to_run(estimates: Sequence[Estimate]) -> float:
@@ -254,9 +284,11 @@ def fit_jointly(chains: CutChains, findings: Mapping[str, Findings], *, gust: bo
         joint, values, sd, alone = _fitted(chains, found)
     checks = _checks(chains, found)
 
+    def forms() -> dict[str, float]:
+        return {stage: check.form for stage, check in checks.items() if stage != "arm" or not gust}
+
     def widened() -> dict[str, float]:
-        formed = {b: c for b, c in checks.items() if b != "arm" or not gust}
-        return _widened(chains, found, values, sd, formed)
+        return _widened(chains, found, values, sd, forms())
 
     while not chains.policy.calibrated and (weak := _least_needed(chains.model, found, values, widened())):
         stage, selection = weak
@@ -264,7 +296,7 @@ def fit_jointly(chains: CutChains, findings: Mapping[str, Findings], *, gust: bo
         found[stage] = replace(f, final=refit(chains, stage, f.effects, f.final.values))
         joint, values, sd, alone = _fitted(chains, found)
         checks = _checks(chains, found)
-    return JointFit(chains, found, joint, values, widened(), checks, alone)
+    return JointFit(chains, found, joint, values, widened(), checks, forms(), alone)
 
 
 def _fitted(chains: CutChains, findings: Mapping[str, Findings]
@@ -345,16 +377,16 @@ def _checks(chains: CutChains, findings: Mapping[str, Findings]) -> dict[str, Ch
 
 
 def _widened(chains: CutChains, findings: Mapping[str, Findings], values: Mapping[str, float],
-             sd: Mapping[str, float], checks: Mapping[str, Check]) -> dict[str, float]:
+             sd: Mapping[str, float], forms: Mapping[str, float]) -> dict[str, float]:
     """Standard deviations with the uncertainty from the form of an effect.
 
     A true effect of another form leaves a rest that free curves still explain. The error of the effect's parameters is
     taken as of the same relative size as that rest.
     """
     wider = dict(sd)
-    for stage, check in checks.items():
+    for stage, form in forms.items():
         for name in {p.name for h in findings[stage].effects for p in h.own}:
-            wider[name] = math.hypot(sd[name], check.form * (values[name] - neutral(chains.model, name)))
+            wider[name] = math.hypot(sd[name], form * (values[name] - neutral(chains.model, name)))
     return wider
 
 
@@ -369,7 +401,7 @@ def _least_certain(chains: CutChains, findings: Mapping[str, Findings], joint: F
             off = selection[0].hypothesis.parameter and chains.known is None
             if selection[0].gain > CERTAIN and not off and not contradicted:
                 continue  # its existence is certain; only its size and those of other values cannot be separated
-            spread = max(sd[size], nominal_sd(chains, size))
+            spread = max(size_sd(selection[0].hypothesis, joint, sd), nominal_sd(chains, size))
             certain.append((abs(values[size] - neutral(model, size)) / spread, stage, selection))
     worst = min(certain, key=lambda c: c[0], default=None)
     return worst[1:] if worst is not None and worst[0] < SURE else None

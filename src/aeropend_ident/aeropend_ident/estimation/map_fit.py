@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import NamedTuple
@@ -144,6 +144,19 @@ class Fit:
             weight = ess[channel] / len(self.residuals[channel]) / self.scale[channel] ** 2
             information[np.ix_(by, by)] += weight * products
         return information
+
+    def sd_given(self, name: str, held: Collection[str]) -> float:
+        """Standard deviation of an estimate while some other parameters are held at theirs.
+
+        Args:
+            name: of the parameter.
+            held: names of the others.
+        """
+        free = [j for j, n in enumerate(self.values) if n not in held]
+        information, at = self.information(self.ess), free.index(list(self.values).index(name))
+        less, all_ = (float(covariance_of(information[np.ix_(own, own)])[k, k])
+                      for own, k in ((free, at), (list(range(len(information))), free[at])))
+        return self.sd[name] * math.sqrt(min(less / all_, 1.0))
 
 
 def estimate(values: dict[str, float], sd: dict[str, float]) -> Fit:
