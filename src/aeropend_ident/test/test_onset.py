@@ -42,10 +42,11 @@ def test_an_effect_that_acts_all_the_time_has_no_instant():
 
 
 @pytest.mark.promise("Verdict", "A change in the last part of a recording is judged too")
-def test_a_change_in_the_part_that_is_held_out_at_first():
-    signals = changing(32, {"coulomb_friction": {}}, since=29.5)
+@pytest.mark.parametrize(("effect", "since"), [("coulomb_friction", 29.5), ("current_offset", 27.6)])
+def test_a_change_in_the_part_that_is_held_out_at_first_or_just_before(effect, since):
+    signals = changing(32, {effect: {}}, since)
     made = diagnose(BENCH, [signals])
     text = "\n".join(verdict_lines(document(made, ["bag"], "bench", 0.0)))
-    assert made.conclusions.which.effects == ("coulomb_friction",)
-    assert "begins at 29." in text
+    assert made.conclusions.which.effects == (effect,)
+    assert f"begins at {since:.1f}" in text
     assert any("only the rest is held out" in note for s in made.signals for note in s.notes)

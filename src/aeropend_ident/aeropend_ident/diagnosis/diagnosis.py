@@ -149,7 +149,7 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     """The steps after the chain is cut; `fitted`: the chains whose training part parameters are fitted to."""
     found = _find(fitted, settings, progress)
     found, joint, gaps = fit_and_measure(fitted, found, progress)
-    if found.unknown is None and _changes_later(gaps):  # an unknown effect may show elsewhere in what follows
+    if _changes_later(gaps):
         return _diagnose(_fitted_further(fitted), settings, progress)
     closed = [stage for stage in found.stages if gaps.after.within(gaps.floors, CHANNELS_OF[stage])]
     if found.unknown is not None and found.unknown.stage in closed:
