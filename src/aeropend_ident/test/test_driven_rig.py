@@ -158,6 +158,15 @@ def test_a_rest_at_the_end_is_left_out_and_one_between_is_not():
     assert end_of_motion(np.roll(theta, 400), np.roll(duty, 400), 0.001, 0.3) == 0
 
 
+def test_an_arm_that_lies_at_the_end_of_its_range_rests_whatever_the_duty_does():
+    """A motor that turns backward presses the arm onto its rest: the duty has a ramp there."""
+    duty = np.concatenate([np.repeat([0.0, 0.4], [100, 400]), np.linspace(-0.4, 0.0, 500)])
+    theta = np.where(duty > 0.0, 0.5, 0.0) + 0.001 * np.random.default_rng(0).standard_normal(1000)
+    assert end_of_motion(theta, duty, 0.001, 0.3) == pytest.approx(525, abs=2)
+    held = np.concatenate([0.25 + 0.25 * np.cos(np.linspace(0.0, 20.0, 500)), np.full(500, 0.25)])  # between the ends
+    assert end_of_motion(held, duty, 0.001, 0.3) == 0
+
+
 @pytest.mark.promise("Uncalibrated rigs", "A thrust that falls more slowly than it rises is the rig's own model")
 def test_a_lag_that_differs_between_rise_and_fall_is_found():
     s = driven({}, {"thrust_lag": {"tau": 0.1, "fall": 4.0}}, seconds=40.0)

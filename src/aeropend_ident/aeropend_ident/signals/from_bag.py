@@ -317,7 +317,7 @@ def from_uncalibrated(read: Recording, sensing: Mapping[str, float], held_out: f
         last = end_of_motion(columns["theta"], columns["duty"], sigma["theta"], held_out) if alone else 0
         if last * period >= MINIMUM_DURATION:
             columns = {name: x[:last] for name, x in columns.items()}
-            notes = (*notes, f"the arm rests under a constant duty from {last * period:.1f} s on: the rest is left out")
+            notes = (*notes, f"the arm rests from {last * period:.1f} s on: the rest is left out")
     signals = from_arrays(columns, period, own, held_out, read.path, notes)
     if signals.pulses is not None:  # the accuracy of the speed is that of its pulses
         sigma.pop("omega", None)
@@ -327,9 +327,9 @@ def from_uncalibrated(read: Recording, sensing: Mapping[str, float], held_out: f
 
 
 def end_of_motion(theta: Array, duty: Array, sigma: float, held_out: float) -> int:
-    """Samples after which an arm rests under a constant duty, if most of the held-out part is such a rest; else 0.
+    """Samples after which an arm rests, if most of the held-out part is such a rest; else 0.
 
-    Where nothing happens, no model can be judged.
+    Where nothing happens, no model can be judged. The duty is constant there, or the arm lies at an end of its range.
 
     Args:
         theta: [rad] (N,) angle, NaN where missing.
@@ -339,8 +339,10 @@ def end_of_motion(theta: Array, duty: Array, sigma: float, held_out: float) -> i
     """
     known = np.flatnonzero(np.isfinite(theta))
     x = theta[known]
-    away = np.abs(x - np.median(x[-max(len(x) // 50, 1):])) > max(MOVES * sigma, RESTS * float(np.ptp(x)))
-    changed = np.flatnonzero(np.abs(duty - duty[-1]) > RESTS * float(np.ptp(duty)))
+    rest, near = np.median(x[-max(len(x) // 50, 1):]), max(MOVES * sigma, RESTS * float(np.ptp(x)))
+    away = np.abs(x - rest) > near
+    lies = min(rest - x.min(), x.max() - rest) <= near
+    changed = np.flatnonzero((np.abs(duty - duty[-1]) > RESTS * float(np.ptp(duty))) & (not lies))
     last = max(int(known[away][-1]) if away.any() else 0, int(changed[-1]) if len(changed) else 0) + 1
     kept = min(round((1.0 + SETTLES) * last), len(duty))
     return kept if kept < (1.0 - MOSTLY * held_out) * len(duty) else 0
