@@ -201,15 +201,15 @@ def test_what_the_catalogue_explains_leaves_nothing_unknown(effects):
 
 
 @pytest.mark.promise("Verdict", "Readings at unsteady instants are no unknown effect")
-@pytest.mark.parametrize("seed", [5, 6])
-def test_readings_at_unsteady_instants_are_nothing_unknown(seed):
+@pytest.mark.parametrize(("seed", "most", "above", "below"), [(5, 0.45, 1.1, 1.3), (6, 0.45, 1.1, 1.3), (6, 0.75, 1.35, 1.55)])
+def test_readings_at_unsteady_instants_are_nothing_unknown(seed, most, above, below):
     def unsteady(columns, truth):
-        late = np.random.default_rng(seed).uniform(-0.45, 0.45, len(truth["i_a"]))
+        late = np.random.default_rng(seed).uniform(-most, most, len(truth["i_a"]))
         columns["i_a"] = columns["i_a"] + late * np.gradient(truth["i_a"])
 
     diagnosis = diagnose(BENCH, [recording({}, seed, 20.0, unsteady)])
     left = diagnosis.body["which"]["residuals"]["i_a"]
-    assert 1.1 < left["rms"] < 1.3
+    assert above < left["rms"] < below
     assert diagnosis.body["which"]["verdict"] == "none"
 
 

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from aeropend_ident.diagnosis.policy import CERTAIN, GOOD_ENOUGH, MATERIAL_SHARE
 from aeropend_ident.diagnosis.search import speed_spikes
 from aeropend_ident.diagnosis.search.findings import Findings
 from aeropend_ident.diagnosis.search.free_curves import MissingTerm, missing_terms
+from aeropend_ident.diagnosis.search.search import FOLLOWS
 from aeropend_ident.diagnosis.search.selection import noise_over_spread
 from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter, key
@@ -39,7 +41,7 @@ Derived: they explain less than they leave."""
 WHITE = 0.5
 """Effective sample size, over the samples, above which a residual is white noise (choice).
 
-A small white excess is noise that was not seen before: readings at unsteady instants, or a coarser resolution."""
+A white excess is noise that was not seen before: readings at unsteady instants, or a coarser resolution."""
 
 VISIBLE = 0.005
 """RMS of a channel's misfit, relative to the channel's spread, above which it matters (choice)."""
@@ -69,7 +71,7 @@ class Misfit:
         square: mean square residual, in units of a reading's noise.
         noise: standard deviation of a reading, in units of that of the channel.
         count: readings that were fitted.
-        white: whether it is white noise.
+        white: whether it is white noise: small, or following neither inputs nor states.
         noticeable: mean square above which a misfit counts.
     """
 
@@ -82,7 +84,7 @@ class Misfit:
     @property
     def amount(self) -> float:
         """Squared gap above the noise, in units of the spread squared; 0 if it passes as noise."""
-        if self.white and self.square < GOOD_ENOUGH**2:
+        if self.white:
             return 0.0
         shows = max(self.square - 1.0, 0.0) * self.noise**2
         return shows if self.square > self.noticeable + BY_CHANCE * math.sqrt(2.0 / self.count) else 0.0
@@ -113,13 +115,14 @@ def judge(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool, sp
         spikes: whether `speed_spikes` was detected: false captures that were not recognised are then no misfit.
         closed: stages in which the joint fit has closed the gap.
     """
+    limits = chains.policy.unknown
+    known = {b: [p for p in nominal_parameters(chains, b) if p.name in f.base.values] for b, f in findings.items()}
+
     def misfits(fits: Mapping[str, Fit]) -> Misfits:
-        return {b: {c: _misfit(chains, c, r) for c, r in f.residuals.items()
+        return {b: {c: _misfit(chains, c, r, partial(_follows, chains, b, f, known[b])) for c, r in f.residuals.items()
                     if not (spikes and key(c).name == "omega") and not (gust and key(c).name == "theta")}
                 for b, f in fits.items()}
 
-    limits = chains.policy.unknown
-    known = {b: [p for p in nominal_parameters(chains, b) if p.name in f.base.values] for b, f in findings.items()}
     base = misfits({b: f.base for b, f in findings.items()})
     left = misfits({b: f.final for b, f in findings.items()})
     amount = {b: sum(m.amount for m in left[b].values()) for b in findings}
@@ -166,7 +169,14 @@ def _placed(chains: CutChains, stage: str, base: Fit, known: list[Parameter]) ->
     return next(t for t in missing_terms(chains, stage, base, known) if t.place == place)
 
 
-def _misfit(chains: CutChains, channel: str, r: Array) -> Misfit:
-    white = effective_sample_size(r) > WHITE * len(r)
-    return Misfit(float(np.mean(r * r)), noise_over_spread(chains, channel), len(r), white,
-                  chains.policy.unknown.noticeable)
+def _misfit(chains: CutChains, channel: str, r: Array, follows: Callable[[], bool]) -> Misfit:
+    """The misfit of a channel; `follows`: whether the rest of its stage follows inputs and states."""
+    square = float(np.mean(r * r))
+    white = effective_sample_size(r) > WHITE * len(r) and (square < GOOD_ENOUGH**2 or not follows())
+    return Misfit(square, noise_over_spread(chains, channel), len(r), white, chains.policy.unknown.noticeable)
+
+
+def _follows(chains: CutChains, stage: str, f: Fit, known: Sequence[Parameter]) -> bool:
+    """Whether what a fit of a stage leaves follows inputs and states."""
+    term = missing_terms(chains, stage, f, known)[0]
+    return term.explained > FOLLOWS * term.before
