@@ -201,7 +201,8 @@ def test_what_the_catalogue_explains_leaves_nothing_unknown(effects):
 
 
 @pytest.mark.promise("Verdict", "Readings at unsteady instants are no unknown effect")
-@pytest.mark.parametrize(("seed", "most", "above", "below"), [(5, 0.45, 1.1, 1.3), (6, 0.45, 1.1, 1.3), (6, 0.75, 1.35, 1.55)])
+@pytest.mark.parametrize(("seed", "most", "above", "below"), [
+    (5, 0.45, 1.1, 1.3), (6, 0.45, 1.1, 1.3), (6, 0.75, 1.35, 1.55)])
 def test_readings_at_unsteady_instants_are_nothing_unknown(seed, most, above, below):
     def unsteady(columns, truth):
         late = np.random.default_rng(seed).uniform(-most, most, len(truth["i_a"]))
