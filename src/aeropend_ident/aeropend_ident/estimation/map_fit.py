@@ -68,11 +68,6 @@ Choice; any factors from 0.1 and 10 on lead to the same minimum."""
 GOOD_STEP = 0.75
 """Share of the expected decrease below which the derivatives are computed anew, rather than corrected (choice)."""
 
-TRUSTED = 0.1
-"""Part of the expected decrease by which a step may gain less or more, if a fit is to end with corrected derivatives.
-
-Choice: two verdicts differ by more than what such derivatives miss."""
-
 NARROWEST = 8
 """Coefficients of the cosine transform in the narrowest band (choice: their mean square is then good to a half)."""
 
@@ -264,7 +259,7 @@ class Search:
         self.prior = prior_information(parameters)
         self.current = self.at(self.z)
         self.slopes: dict[str, Sensitivities] = {}
-        self.exact = self.trusted = False
+        self.fresh = False
         self.renew_weights()
 
     def at(self, z: Array) -> dict[str, Array]:
@@ -379,37 +374,35 @@ class Search:
             if done and passed(deadline):
                 break
             if not self.slopes:
-                self.slopes, self.exact, self.trusted = self.differences(), True, True
+                self.slopes, self.fresh = self.differences(), True
             r = self.stack(self.current)
             information, gradient, products = self.normal_equations(self.weighted(self.slopes))
             cost = float(r @ r + self.z @ self.prior @ self.z)
-            enough = ENOUGH + ENOUGH_OF_EXCESS * max(cost - sum(self.ess.values()), 0.0)
-            exact, gained, promised = self.exact, 0.0, math.inf
+            gained = expected = 0.0
             free = self.free(self.z, gradient)
             step = np.zeros(len(self.z))
             reduced = information[np.ix_(free, free)]
             while damping < MOST_DAMPING:
                 step[free] = np.linalg.solve(reduced + damping * np.diag(np.diag(reduced)), -gradient[free])
                 z = np.clip(self.z + step, self.low, self.high)
-                moved = z - self.z
-                promised = -float(moved @ (2.0 * gradient + information @ moved))
                 trial = self.at(z)
                 r = self.stack(trial)
                 new = float(r @ r + z @ self.prior @ z)
                 if np.isfinite(new) and new < cost:
-                    gained = cost - new
+                    gained, moved = cost - new, z - self.z
+                    expected = -float(moved @ (2.0 * gradient + information @ moved))
                     self.slopes = {k: s.corrected(moved, trial[k] - self.current[k]) for k, s in self.slopes.items()}
-                    self.z, self.current, self.exact = z, trial, False
+                    self.z, self.current = z, trial
                     damping *= DAMPING_DOWN
                     break
-                if not exact or promised < ENOUGH:
+                if not self.fresh:
                     break
                 damping *= DAMPING_UP
-            ended = gained < enough
-            if ended and (exact or (self.trusted and promised < enough)):
+            ended = gained < ENOUGH + ENOUGH_OF_EXCESS * max(cost - sum(self.ess.values()), 0.0)
+            if ended and self.fresh:
                 break
-            self.trusted = self.trusted and abs(gained - promised) < TRUSTED * promised
-            if ended or gained < GOOD_STEP * promised:
+            self.fresh = False
+            if ended or gained < GOOD_STEP * expected:
                 self.slopes = {}
         return information, products
 
