@@ -40,18 +40,6 @@ def test_an_uncertain_size_and_a_gap_that_varies_widen_the_interval():
     assert 0.1 < widths[2] < 1.0
 
 
-def test_an_effect_whose_form_may_be_another_is_surely_there():
-    """That its size has another meaning widens its share's interval; it does not make the effect absent."""
-    other_form, noisy = part("current_gain", 2.0, unsure=0.05), part("current_gain", 2.0, unsure=1.0)
-    other_form = replace(other_form, form=1.0)
-    beside = part("supply_drift", 1.0, unsure=0.05)
-    parts = [other_form, beside]
-    assert shares(parts)["current_gain"].low == 0.0
-    assert headline(parts, shares(parts), 0.03).verdict == "current_gain"
-    parts = [noisy, beside]
-    assert headline(parts, shares(parts), 0.03).verdict == "supply_drift"
-
-
 def test_effects_that_stand_in_for_each_other_have_parts_that_add_up_to_what_they_close_together():
     alike = [part("quadratic_drag", 0.5), part("coulomb_friction", 1.5), part("gust", -0.1)]
     assert [p.amount for p in gap_share._adding_up(alike, 4.0)] == pytest.approx([1.0, 3.0, -0.1])

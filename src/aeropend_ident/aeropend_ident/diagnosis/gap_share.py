@@ -252,8 +252,7 @@ def part_of_spikes(spikes: RankedHypothesis, with_: Gap, without: Gap) -> Part:
     return replace(part, amount=max(part.amount, 0.0))
 
 
-def shares(parts: Sequence[Part], *, shared: float = SHARED, forms: bool = True, ends: bool = True, seed: int = 0
-           ) -> dict[str, Interval]:
+def shares(parts: Sequence[Part], *, shared: float = SHARED, ends: bool = True, seed: int = 0) -> dict[str, Interval]:
     """Name -> share of the gap, with a 95 % interval.
 
     The interval holds the scatter over time (block bootstrap, H. Künsch, 1989) and the uncertainty of the size. It also
@@ -264,7 +263,6 @@ def shares(parts: Sequence[Part], *, shared: float = SHARED, forms: bool = True,
     Args:
         parts: of the gap.
         shared: as `SHARED`; 0 leaves out what is unexplained.
-        forms: whether the true form of an effect may be another.
         ends: whether the intervals reach to the ends of the parts.
         seed: of the bootstrap.
     """
@@ -277,7 +275,7 @@ def shares(parts: Sequence[Part], *, shared: float = SHARED, forms: bool = True,
     blocks = min(len(p.windows) for p in parts)
     picks = rng.integers(0, blocks, (RESAMPLES, blocks)) if blocks > 1 else np.zeros((RESAMPLES, 1), dtype=np.intp)
     # a size of the other sign closes nothing
-    unsure = [math.hypot(p.unsure, p.form if forms else 0.0) for p in parts]
+    unsure = [math.hypot(p.unsure, p.form) for p in parts]
     size = [np.maximum(1.0 + x * rng.standard_normal(RESAMPLES), 0.0) for x in unsure]
     drawn = np.array([p.windows[picks].mean(axis=1) * x**2 for p, x in zip(parts, size, strict=True)])
     drawn /= np.maximum(np.maximum(drawn, 0.0).sum(axis=0), total * LEAST_DRAWN)
@@ -315,7 +313,7 @@ def headline(parts: Sequence[Part], share: Mapping[str, Interval], material: flo
             be there.
     """
     named = sorted((p for p in parts if p.name), key=lambda p: -p.amount)
-    scatter = shares(parts, shared=0.0, forms=False, ends=False)  # an effect of another form is there too
+    scatter = shares(parts, shared=0.0, ends=False)
     likely = [p for p in named if p.name in share and share[p.name].value >= material
               and (p.name == UNKNOWN or scatter[p.name].low > 0.0)]
     least = material * whole(parts)
