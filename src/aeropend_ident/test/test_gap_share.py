@@ -66,9 +66,9 @@ class Fitted:
         self.findings = {f"stage {k}": SimpleNamespace(effects=effects) for k, effects in enumerate(stages)}
         self.chains, self.fixed, self.again = SimpleNamespace(known=None), fixed, again
         self.values = {p.name: 1.0 for effects in stages for h in effects for p in h.own}
-        self.forms, self.before = dict[str, float](), 2.0
+        self.before = 2.0
 
-    def unsure(self, effect, form):
+    def unsure(self, effect):
         return 0.1
 
     def fit_without(self, wanted, jobs=1):

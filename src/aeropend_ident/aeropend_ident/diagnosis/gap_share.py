@@ -56,8 +56,7 @@ class Part:
         place: of the chain.
         amount: squared gap, in units of the spread squared.
         windows: (W,) the same over each window of the bootstrap.
-        unsure: relative standard deviation of the size of the effect by noise, its other parameters held.
-        form: relative error of the size, since the true form of the effect may be another.
+        unsure: relative standard deviation of the size of the effect, its other parameters held.
         ends: least and most that it may be, as effects stand in for each other.
         unique: what comes back without it although the other effects are fitted again: no other effect closes that.
     """
@@ -67,7 +66,6 @@ class Part:
     amount: float
     windows: Array
     unsure: float = 0.0
-    form: float = 0.0
     ends: tuple[float, float] = (math.inf, -math.inf)
     unique: float = math.inf
 
@@ -113,7 +111,6 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, before: Gap, material: 
         jobs: processes.
     """
     stages = [f.effects for f in joint.findings.values() if f.effects]
-    form_of = {h.name: joint.forms.get(stage, 0.0) for stage, f in joint.findings.items() for h in f.effects}
     if not stages:
         return []
     after = held_out.gap_of(joint.values)
@@ -132,8 +129,7 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, before: Gap, material: 
     again = {h.name: gap(every) if len(every) == 1 else held_out.gap_of(joint.without([h], others=True)) for h in tried}
 
     def part(effect: Hypothesis, effects: Sequence[Hypothesis]) -> Part:
-        form = form_of[effect.name]
-        unsure = min(joint.unsure(effect, form), LARGEST_UNSURE)
+        unsure = min(joint.unsure(effect), LARGEST_UNSURE)
         last, first, alone = (_coming_back(effect.name, effect.place, gap(without), gap(with_), unsure)
                               for without, with_ in (([effect], []), (effects, _but(effects, effect)),
                                                      (every, _but(every, effect))))
@@ -146,7 +142,7 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, before: Gap, material: 
                 first = _coming_back(effect.name, effect.place, gap(effects), with_, unsure)
         amounts = [p.amount for p in (last, first, alone)]
         return replace(last, amount=0.5 * (last.amount + first.amount), windows=0.5 * (last.windows + first.windows),
-                       form=form, ends=(min(amounts), max(amounts)), unique=unique)
+                       ends=(min(amounts), max(amounts)), unique=unique)
 
     parts = [p for effects in stages for p in _adding_up(
         [part(h, effects) for h in effects], squared(gap(effects)) - squared(after))]
@@ -275,8 +271,7 @@ def shares(parts: Sequence[Part], *, shared: float = SHARED, ends: bool = True, 
     blocks = min(len(p.windows) for p in parts)
     picks = rng.integers(0, blocks, (RESAMPLES, blocks)) if blocks > 1 else np.zeros((RESAMPLES, 1), dtype=np.intp)
     # a size of the other sign closes nothing
-    unsure = [math.hypot(p.unsure, p.form) for p in parts]
-    size = [np.maximum(1.0 + x * rng.standard_normal(RESAMPLES), 0.0) for x in unsure]
+    size = [np.maximum(1.0 + p.unsure * rng.standard_normal(RESAMPLES), 0.0) for p in parts]
     drawn = np.array([p.windows[picks].mean(axis=1) * x**2 for p, x in zip(parts, size, strict=True)])
     drawn /= np.maximum(np.maximum(drawn, 0.0).sum(axis=0), total * LEAST_DRAWN)
     rest = np.sqrt(sum((np.maximum(d, 0.0) for p, d in zip(parts, drawn, strict=True) if p.name in ("", UNKNOWN)),

@@ -85,7 +85,6 @@ class JointFit:
         values: name -> estimate.
         sd: name -> standard deviation, with the uncertainty from the form of an effect.
         checks: stage -> tests of what is left of it.
-        forms: stage -> relative error of the size of an effect, since its true form may be another.
         alone: name -> estimate and standard deviation of each of several calibrated recordings, fitted alone.
     """
 
@@ -95,7 +94,6 @@ class JointFit:
     values: dict[str, float]
     sd: dict[str, float]
     checks: dict[str, Check]
-    forms: dict[str, float] = field(default_factory=dict)
     alone: dict[str, tuple[Estimate, ...]] = field(default_factory=dict)
     _fitted_without: dict[tuple[frozenset[str], bool], dict[str, float]] = field(default_factory=dict, repr=False)
 
@@ -200,17 +198,11 @@ class JointFit:
         ends = (p.mean - TOLERANCE * p.sd, p.mean + TOLERANCE * p.sd, *also)
         return replace(p, low=max(p.low, min(ends)), high=min(p.high, max(ends)))
 
-    def unsure(self, effect: Hypothesis, form: float) -> float:
-        """Relative standard deviation of the size of an effect by noise alone; see `size_sd`.
-
-        Args:
-            effect: that was found.
-            form: what `forms` has for its stage.
-        """
+    def unsure(self, effect: Hypothesis) -> float:
+        """Relative standard deviation of the size of an effect that was found; see `size_sd`."""
         size = effect.own[0].name
         distance = abs(self.values[size] - neutral(self.chains.model, size))
-        by_noise = math.sqrt(max(self.sd[size] ** 2 - (form * distance) ** 2, 0.0))
-        return size_sd(effect, self.fit, {size: by_noise}) / max(distance, 1e-300)
+        return size_sd(effect, self.fit, self.sd) / max(distance, 1e-300)
 
     def expected_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         """The values without some of the effects if the readings were linear in all of them."""
@@ -284,11 +276,9 @@ def fit_jointly(chains: CutChains, findings: Mapping[str, Findings], *, gust: bo
         joint, values, sd, alone = _fitted(chains, found)
     checks = _checks(chains, found)
 
-    def forms() -> dict[str, float]:
-        return {stage: check.form for stage, check in checks.items() if stage != "arm" or not gust}
-
     def widened() -> dict[str, float]:
-        return _widened(chains, found, values, sd, forms())
+        formed = {b: c for b, c in checks.items() if b != "arm" or not gust}
+        return _widened(chains, found, values, sd, formed)
 
     while not chains.policy.calibrated and (weak := _least_needed(chains.model, found, values, widened())):
         stage, selection = weak
@@ -296,7 +286,7 @@ def fit_jointly(chains: CutChains, findings: Mapping[str, Findings], *, gust: bo
         found[stage] = replace(f, final=refit(chains, stage, f.effects, f.final.values))
         joint, values, sd, alone = _fitted(chains, found)
         checks = _checks(chains, found)
-    return JointFit(chains, found, joint, values, widened(), checks, forms(), alone)
+    return JointFit(chains, found, joint, values, widened(), checks, alone)
 
 
 def _fitted(chains: CutChains, findings: Mapping[str, Findings]
@@ -377,16 +367,16 @@ def _checks(chains: CutChains, findings: Mapping[str, Findings]) -> dict[str, Ch
 
 
 def _widened(chains: CutChains, findings: Mapping[str, Findings], values: Mapping[str, float],
-             sd: Mapping[str, float], forms: Mapping[str, float]) -> dict[str, float]:
+             sd: Mapping[str, float], checks: Mapping[str, Check]) -> dict[str, float]:
     """Standard deviations with the uncertainty from the form of an effect.
 
     A true effect of another form leaves a rest that free curves still explain. The error of the effect's parameters is
     taken as of the same relative size as that rest.
     """
     wider = dict(sd)
-    for stage, form in forms.items():
+    for stage, check in checks.items():
         for name in {p.name for h in findings[stage].effects for p in h.own}:
-            wider[name] = math.hypot(sd[name], form * (values[name] - neutral(chains.model, name)))
+            wider[name] = math.hypot(sd[name], check.form * (values[name] - neutral(chains.model, name)))
     return wider
 
 

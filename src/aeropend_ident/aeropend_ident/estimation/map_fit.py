@@ -152,11 +152,12 @@ class Fit:
             name: of the parameter.
             held: names of the others.
         """
-        free = [j for j, n in enumerate(self.values) if n not in held]
-        information, at = self.information(self.ess), free.index(list(self.values).index(name))
-        less, all_ = (float(covariance_of(information[np.ix_(own, own)])[k, k])
-                      for own, k in ((free, at), (list(range(len(information))), free[at])))
-        return self.sd[name] * math.sqrt(min(less / all_, 1.0))
+        names, information = list(self.values), self.information(self.ess)
+        free = [n for n in names if n not in held]
+        own = [names.index(n) for n in free]
+        given = np.diag(covariance_of(information[np.ix_(own, own)]))[free.index(name)]
+        variance = np.diag(covariance_of(information))[names.index(name)]
+        return self.sd[name] * math.sqrt(min(float(given / variance), 1.0))
 
 
 def estimate(values: dict[str, float], sd: dict[str, float]) -> Fit:
