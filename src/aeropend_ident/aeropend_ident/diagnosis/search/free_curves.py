@@ -71,6 +71,13 @@ CHANCE = 3.0
 
 Measured: at ±30 % no verdict of 25 recordings changes (docs/results/thresholds.md)."""
 
+FOLLOWS = 0.01
+"""Share of a mean square that free curves must explain, beyond chance, for a residual to follow inputs and states.
+
+Choice: so little does not change a verdict, and is far above chance with some thousand samples.
+
+Measured: at ±30 % no verdict of 2 recordings changes (docs/results/thresholds.md)."""
+
 LARGEST = 1e30
 """Largest response (choice: one beyond it is of a model that diverges, and products of it are still numbers)."""
 
@@ -137,6 +144,11 @@ class MissingTerm:
         """Mean square that the curves explain beyond what they would explain of white noise."""
         chance = CHANCE * sum(len(c.value) for c in self.curves) / self.samples
         return max(self.before - self.left - chance * self.before, 0.0)
+
+    @property
+    def follows(self) -> bool:
+        """Whether the residual follows inputs and states."""
+        return self.explained > FOLLOWS * self.before
 
 
 def knots_of(x: Array, count: int = KNOTS) -> Array:

@@ -44,13 +44,6 @@ from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess, passed
 from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter, started
 
-FOLLOWS = 0.01
-"""Share of a mean square that free curves must explain, beyond chance, for a residual to follow inputs and states.
-
-Choice: so little does not change a verdict, and is far above chance with some thousand samples.
-
-Measured: at ±30 % no verdict of 2 recordings changes (docs/results/thresholds.md)."""
-
 TRIFLE = 0.1
 """Part of a material share of the gap below which the rest of a stage is not searched, nor an effect accepted (choice).
 
@@ -393,7 +386,7 @@ def _explained(here: SelectionRound) -> bool:
     if not policy.wide_search or not passes_as_noise(here.current, policy.noise_margin):
         return False
     term = missing_terms(here.chains, here.stage, here.current, here.known)[0]
-    return term.explained <= FOLLOWS * term.before
+    return not term.follows
 
 
 def passes_as_noise(f: Fit, material: float) -> bool:

@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from aeropend_ident.diagnosis.policy import CERTAIN, GOOD_ENOUGH, MATERIAL_SHARE
 from aeropend_ident.diagnosis.search import speed_spikes
 from aeropend_ident.diagnosis.search.findings import Findings
 from aeropend_ident.diagnosis.search.free_curves import MissingTerm, missing_terms
-from aeropend_ident.diagnosis.search.search import FOLLOWS
 from aeropend_ident.diagnosis.search.selection import noise_over_spread
 from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter, key
@@ -117,14 +116,18 @@ def judge(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool, sp
     """
     limits = chains.policy.unknown
     known = {b: [p for p in nominal_parameters(chains, b) if p.name in f.base.values] for b, f in findings.items()}
+    fits = {"base": {b: f.base for b, f in findings.items()}, "final": {b: f.final for b, f in findings.items()}}
 
-    def misfits(fits: Mapping[str, Fit]) -> Misfits:
-        return {b: {c: _misfit(chains, c, r, partial(_follows, chains, b, f, known[b])) for c, r in f.residuals.items()
+    @cache
+    def missing(which: str, b: str) -> MissingTerm:
+        return missing_terms(chains, b, fits[which][b], known[b])[0]
+
+    def misfits(which: str) -> Misfits:
+        return {b: {c: _misfit(chains, c, r, partial(missing, which, b)) for c, r in f.residuals.items()
                     if not (spikes and key(c).name == "omega") and not (gust and key(c).name == "theta")}
-                for b, f in fits.items()}
+                for b, f in fits[which].items()}
 
-    base = misfits({b: f.base for b, f in findings.items()})
-    left = misfits({b: f.final for b, f in findings.items()})
+    base, left = misfits("base"), misfits("final")
     amount = {b: sum(m.amount for m in left[b].values()) for b in findings}
     captures = speed_spikes.squared_gap(chains) if spikes else 0.0
 
@@ -138,7 +141,7 @@ def judge(chains: CutChains, findings: Mapping[str, Findings], *, gust: bool, sp
     for b, f in findings.items():
         if b in closed or not any(m.amount > 0.0 for m in base[b].values()):
             continue
-        term = missing_terms(chains, b, f.base, known[b])[0]
+        term = missing("base", b)
         elsewhere = bool(f.found) and term.place not in {h.place for h in f.effects}
         # several effects of one place may be one effect of another form; a parameter has no form
         several = len({h.place for h in f.effects}) > 1 or any(h.parameter for h in f.effects)
@@ -169,14 +172,8 @@ def _placed(chains: CutChains, stage: str, base: Fit, known: list[Parameter]) ->
     return next(t for t in missing_terms(chains, stage, base, known) if t.place == place)
 
 
-def _misfit(chains: CutChains, channel: str, r: Array, follows: Callable[[], bool]) -> Misfit:
-    """The misfit of a channel; `follows`: whether the rest of its stage follows inputs and states."""
+def _misfit(chains: CutChains, channel: str, r: Array, missing: Callable[[], MissingTerm]) -> Misfit:
+    """The misfit of a channel; `missing`: the likeliest missing term of its stage."""
     square = float(np.mean(r * r))
-    white = effective_sample_size(r) > WHITE * len(r) and (square < GOOD_ENOUGH**2 or not follows())
+    white = effective_sample_size(r) > WHITE * len(r) and (square < GOOD_ENOUGH**2 or not missing().follows)
     return Misfit(square, noise_over_spread(chains, channel), len(r), white, chains.policy.unknown.noticeable)
-
-
-def _follows(chains: CutChains, stage: str, f: Fit, known: Sequence[Parameter]) -> bool:
-    """Whether what a fit of a stage leaves follows inputs and states."""
-    term = missing_terms(chains, stage, f, known)[0]
-    return term.explained > FOLLOWS * term.before
