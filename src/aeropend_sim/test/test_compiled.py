@@ -86,6 +86,15 @@ def test_what_is_unchanged_is_loaded_and_old_versions_do_not_pile_up(tree):
     assert cached(folder) == kept
 
 
+def test_code_from_the_cache_runs_without_what_only_the_compiler_needs(tree):
+    (tree / "filled.py").write_text(f"import numpy as np\n{OURS[0]}\n\n\n{OURS[1]}\ndef filled(x):\n"
+                                    "    return np.full(3, x)\n")  # fmt: skip
+    code = ("import sys; from aeropend_sim.filled import filled; "
+            "print(filled(2.0).sum(), 'numba.np.linalg' in sys.modules)")  # fmt: skip
+    assert output(tree, code) == "6.0 True"
+    assert output(tree, code) == "6.0 False"
+
+
 def test_two_processes_that_compile_at_once_never_take_each_others_code(tree):
     (tree / "inner.py").write_text(f"{OURS[0]}\n\n\n{OURS[1]}\ndef doubled(x):\n    return 2 * x\n")
     whole, real = (f"from aeropend_sim.inner import doubled; print(doubled({x}))" for x in (3, 1.5))
