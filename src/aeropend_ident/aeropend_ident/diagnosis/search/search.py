@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import expit
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
-from aeropend_ident.diagnosis.chain.priors import model_parameters, nominal_parameters
+from aeropend_ident.diagnosis.chain.priors import TOLERANCE, model_parameters, nominal_parameters
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, STAGES
 from aeropend_ident.diagnosis.policy import MATERIAL, MATERIAL_SHARE
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis, adopted, drop_unneeded
@@ -236,8 +236,9 @@ def _select(here: SelectionRound, findings: Findings, candidates: list[Hypothesi
         here = replace(here, current=again)
         ranked = here.ranked(tried)
     best = ranked[0]
+    shows = _material(here.current, best.fit) or beyond_tolerance(chains, here.stage, here.current)
     matters = (best.hypothesis.parameter or at_end_of_prior(chains, here.stage, here.current)
-               or (_material(here.current, best.fit) and here.closes(best.fit) > here.trifle))
+               or (shows and here.closes(best.fit) > here.trifle))
     if not policy.driven and findings.found:  # a residual in a narrow band seems to hold many independent samples
         sure = [float(expit(log_evidence_over(here.current, r.fit) + r.hypothesis.log_odds)) for r in ranked]
         ranked = tuple(replace(r, probability=min(r.probability, p)) for r, p in zip(ranked, sure, strict=True))
@@ -372,6 +373,13 @@ def at_end_of_prior(chains: CutChains, stage: str, f: Fit) -> bool:
         not p.low < f.values[n] < p.high for n, p in own.items() if n in f.values)
 
 
+def beyond_tolerance(chains: CutChains, stage: str, f: Fit) -> bool:
+    """Whether a calibrated parameter of the stage left its tolerance: it may stand in for a missing effect."""
+    return chains.policy.calibrated and chains.known is None and any(
+        abs(f.values[p.name] - p.mean) > TOLERANCE * p.sd for p in model_parameters(chains, stage)
+        if p.name in f.values)
+
+
 def _explained(here: SelectionRound) -> bool:
     """Whether the rest passes as noise.
 
@@ -380,7 +388,11 @@ def _explained(here: SelectionRound) -> bool:
     """
     if at_end_of_prior(here.chains, here.stage, here.current):
         return False
-    if passes_as_noise(here.current, MATERIAL) or here.left_open(here.current) <= here.trifle:
+    if here.left_open(here.current) <= here.trifle:
+        return True
+    if beyond_tolerance(here.chains, here.stage, here.current):
+        return False
+    if passes_as_noise(here.current, MATERIAL):
         return True
     policy = here.chains.policy
     if not policy.wide_search or not passes_as_noise(here.current, policy.noise_margin):
