@@ -315,37 +315,50 @@ def not_separable(chains: CutChains, findings: Mapping[str, Findings]
         findings: stage -> what is claimed.
     """
     pairs = []
-    for stage, f in findings.items():
+    for f in findings.values():
         before = f.base
         for selection in f.selections:
             if not selection or selection[0].probability <= CALIBRATED.undecided:
                 continue
-            first, found = selection[0], selection in f.found
-            pairs += [(first, r) for r in selection[1:] if r.probability > chains.policy.undecided
-                      or (found and _closes_as_much(chains, stage, f, before, first, r))]
+            first, *rest = selection
+            doubted = [r for r in rest if r.probability <= chains.policy.undecided]
+            alike = _closing_as_much(chains, f, before, first, doubted) if selection in f.found else set()
+            pairs += [(first, r) for r in rest
+                      if r.probability > chains.policy.undecided or r.hypothesis.name in alike]
             before = first.fit
     return pairs
 
 
-def _closes_as_much(chains: CutChains, stage: str, findings: Findings, before: Fit, first: RankedHypothesis,
-                    rival: RankedHypothesis) -> bool:
-    """Whether a rival closes as much of the gap as the first, while neither explains all.
+def _closing_as_much(chains: CutChains, findings: Findings, before: Fit, first: RankedHypothesis,
+                     rivals: Sequence[RankedHypothesis]) -> set[str]:
+    """Names of the rivals of an effect found that close as much of the gap, while neither explains all.
 
     What both leave may then decide between them, if it is more than that by which they differ. A parameter that is off
     only stands in for an effect. Of several effects of a stage, each rival is fitted beside the others.
+
+    Args:
+        chains: cut.
+        findings: of the stage.
+        before: the fit before the effect was found.
+        first: the effect.
+        rivals: of the same selection.
     """
-    if rival.hypothesis.parameter or mean_square(first.fit, stage) < FORM_SHOWS:
-        return False
-    fits = (before, first.fit, rival.fit)
+    stage, best = findings.stage, first.fit
+    rivals = [r for r in rivals if not r.hypothesis.parameter]
+    fits = [r.fit for r in rivals]
+    if not rivals or mean_square(best, stage) < FORM_SHOWS:
+        return set()
     if len(findings.effects) > 1:
         beside = [h for h in findings.effects if h is not first.hypothesis]
-        if rival.gain <= 0.0 or rival.hypothesis.family in {h.family for h in beside}:
-            return False
-        values = {**findings.final.values, **{p.name: rival.fit.values[p.name] for p in rival.hypothesis.own}}
-        fits = (refit(chains, stage, beside, findings.final.values), findings.final,
-                refit(chains, stage, [*beside, rival.hypothesis], values))
-    open_, best, left = (squared_gap(chains, f, CHANNELS_OF[stage]) for f in fits)
-    return left - best < min(MATERIAL_SHARE * (open_ - best), best)
+        rivals = [r for r in rivals if r.gain > 0.0 and r.hypothesis.family not in {h.family for h in beside}]
+        best, now = findings.final, findings.final.values
+        fits = [refit(chains, stage, [*beside, r.hypothesis],
+                      {**now, **{p.name: r.fit.values[p.name] for p in r.hypothesis.own}}) for r in rivals]
+        before = refit(chains, stage, beside, now) if rivals else before
+    closed = squared_gap(chains, best, CHANNELS_OF[stage])
+    most = min(MATERIAL_SHARE * (squared_gap(chains, before, CHANNELS_OF[stage]) - closed), closed)
+    return {r.hypothesis.name for r, f in zip(rivals, fits, strict=True)
+            if squared_gap(chains, f, CHANNELS_OF[stage]) - closed < most}
 
 
 def sets(findings: Mapping[str, Findings]) -> tuple[EffectSet, ...]:

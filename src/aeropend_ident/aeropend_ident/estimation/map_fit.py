@@ -359,12 +359,14 @@ class Search:
         pushed = ((z <= self.low) & (gradient > 0.0)) | ((z >= self.high) & (gradient < 0.0))
         return ~pushed
 
-    def improve(self, steps: int, deadline: float | None = None) -> tuple[Array, Products]:
+    def improve(self, steps: int, deadline: float | None = None, *, first_look: bool = False
+                ) -> tuple[Array, Products]:
         """Take Levenberg-Marquardt steps with the weights as they are.
 
         Args:
             steps: at most.
             deadline: after it, only one; see `passed`.
+            first_look: see `fit`.
 
         Returns:
             Information matrix and products of the last `normal_equations`.
@@ -400,7 +402,7 @@ class Search:
                     break
                 damping *= DAMPING_UP
             ended = gained < ENOUGH + ENOUGH_OF_EXCESS * max(cost - sum(self.ess.values()), 0.0)
-            if ended and self.fresh:
+            if ended and (self.fresh or first_look):
                 break
             self.fresh = False
             if ended or gained < GOOD_STEP * expected:
@@ -436,7 +438,8 @@ def prior_information(parameters: Sequence[Parameter]) -> Array:
 
 
 def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter],
-        rounds: int = 10, steps: int = 4, least_ess: float = 0.0, deadline: float | None = None) -> Fit:
+        rounds: int = 10, steps: int = 4, least_ess: float = 0.0, deadline: float | None = None, *,
+        first_look: bool = False) -> Fit:
     """MAP fit with the noise inflated to the residual; see the module.
 
     Args:
@@ -447,13 +450,15 @@ def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence
         least_ess: effective sample size that a channel counts for at least during the search. A slow drift has a small
             one; with wide priors the search would then stay near their means.
         deadline: after it, the fit ends with its next step; see `passed`.
+        first_look: the fit may end with derivatives that are corrected, where others would gain more. It is good enough
+            to choose what is fitted on.
     """
     search = Search(residuals, parameters, least_ess)
     information, products = search.prior, Products()
     for done in range(rounds):
         if done and passed(deadline):
             break
-        information, products = search.improve(steps, deadline)
+        information, products = search.improve(steps, deadline, first_look=first_look)
         before = search.weight
         search.renew_weights()
         changed = sum(abs(search.weight[k] - before[k]) >= WEIGHT_CHANGE * before[k] for k in before)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -94,13 +95,13 @@ class _Start(NamedTuple):
 
     Attributes:
         hypothesis: that is fitted.
-        rounds: of the fit at most.
+        rounds: of the fit at most; None: of a first look, see `fit`.
         start: number of its start point.
         begun: values to go on from instead; None: the start point.
     """
 
     hypothesis: Hypothesis
-    rounds: int
+    rounds: int | None
     start: int = 0
     begun: Mapping[str, float] | None = None
 
@@ -141,9 +142,8 @@ class SelectionRound:
 
     def screened(self, candidates: list[Hypothesis]) -> FittedHypotheses:
         """The hypotheses that the linear screening leaves, each fitted for some rounds from its best start point."""
-        rounds = self.chains.policy.screening_rounds
         shortlist = self._shortlist(candidates)
-        fits = self._fits([_Start(h, rounds, start, self._better_start(h, start, linear))
+        fits = self._fits([_Start(h, None, start, self._better_start(h, start, linear))
                            for h, start, linear in shortlist])
         return [(h, f) for (h, _, _), f in zip(shortlist, fits, strict=True)]
 
@@ -191,8 +191,7 @@ class SelectionRound:
         if gain + lead.log_odds <= 0.0:
             return tried, None
         best = self._fit(_Start(lead, ROUNDS, begun=begun.values))
-        rounds = self.chains.policy.screening_rounds
-        again = iter(self._fits([_Start(h, rounds, begun=best.values) for h, _ in tried if h is not lead]))
+        again = iter(self._fits([_Start(h, None, begun=best.values) for h, _ in tried if h is not lead]))
         return better(tried, [best if h is lead else next(again) for h, _ in tried]), lead
 
     def converged(self, tried: FittedHypotheses, rounds: int = ROUNDS, *, but: Hypothesis | None = None
@@ -211,8 +210,7 @@ class SelectionRound:
 
     def multi_started(self, tried: FittedHypotheses) -> FittedHypotheses:
         """Fit the contenders from their other start points too: a search may have ended in a local minimum."""
-        rounds = self.chains.policy.screening_rounds
-        starts = [_Start(h, rounds, start) for _, h, _ in self._likeliest(tried)[:CONTENDERS]
+        starts = [_Start(h, None, start) for _, h, _ in self._likeliest(tried)[:CONTENDERS]
                   if len(h.starts) > 1 and not DEFINED[h.effect].linear_in for start in range(len(h.starts))]
         best = _likeliest_of_each(zip([s.hypothesis for s in starts], self._fits(starts), strict=True))
         ended = self._fits([_Start(h, ROUNDS, begun=f.values) for h, f in best])
@@ -359,7 +357,9 @@ class SelectionRound:
         def residuals(values: dict[str, float]) -> dict[str, np.ndarray]:
             return {k: r for function in functions for k, r in function(values).items()}
 
-        steps, least = self.chains.policy.steps, self.chains.policy.least_ess
+        policy = self.chains.policy
+        fit_from = partial(fit, residuals, rounds=rounds or policy.screening_rounds, steps=policy.steps,
+                           least_ess=policy.least_ess, deadline=self.deadline, first_look=rounds is None)
         fitted = hypothesis.parameter or hypothesis.effect in self.chains.model.effects
         if fitted and begun is None:  # it is fitted already: only its prior becomes wider
             begun = self.current.values
@@ -367,12 +367,12 @@ class SelectionRound:
             begun = {**self.current.values, **dict(hypothesis.begun)}
         if begun is None and DEFINED[hypothesis.effect].linear_in:
             first = fit(lambda values: residuals(from_linear(hypothesis.effect, values)),
-                        [*known, *linear_parameters(hypothesis.effect)], rounds=3, least_ess=least,
-                        deadline=self.deadline)
+                        [*known, *linear_parameters(hypothesis.effect)], rounds=3, least_ess=policy.least_ess,
+                        deadline=self.deadline, first_look=True)
             begun = self._within_range(hypothesis.effect, from_linear(hypothesis.effect, first.values))
         if begun is not None:
-            return fit(residuals, started(adopted(known, hypothesis), begun), rounds, steps, least, self.deadline)
-        return fit(residuals, adopted(known, hypothesis, start), rounds, steps, least, self.deadline)
+            return fit_from(started(adopted(known, hypothesis), begun))
+        return fit_from(adopted(known, hypothesis, start))
 
     def _within_range(self, effect: str, own: dict[str, float]) -> dict[str, float]:
         """Values from a linear fit, with the second parameter within its range and the same product.

@@ -227,10 +227,11 @@ class LinearStage:
         within = {n: min(max(v, ends[n].low), ends[n].high) for n, v in values.items()}
         return Predicted(log_evidence + sum(m.hypothesis.log_odds for m in members), within)
 
-    def fitted(self, members: Set, values: Mapping[str, float], rounds: int = ROUNDS) -> Fit:
-        """The fit of a set; `values`: where it starts."""
+    def fitted(self, members: Set, values: Mapping[str, float], *, first_look: bool = False) -> Fit:
+        """The fit of a set, or a first look at it; `values`: where it starts."""
         parameters = reduce(adopted, [m.hypothesis for m in members], [t.parameter for t in self.nominal])
-        return fit(self._residuals, started(parameters, {**self.findings.final.values, **values}), rounds)
+        return fit(self._residuals, started(parameters, {**self.findings.final.values, **values}),
+                   FIRST_ROUNDS if first_look else ROUNDS, first_look=first_look)
 
     def compared(self, members: Set, f: Fit) -> Fit:
         """The fit of a set with the information of its posterior, for a comparison of log evidences."""
@@ -462,7 +463,7 @@ def _climbed(chains: CutChains, findings: Findings, nominal: Sequence[Parameter]
         members, there = best
         seen.add(names(members))
         effects = [m.hypothesis for m in members]
-        f = linear.fitted(members, there.values, FIRST_ROUNDS)
+        f = linear.fitted(members, there.values, first_look=True)
         if _gain(findings, effects, f) > -PROMISING:
             f = linear.fitted(members, f.values)
         if _gain(findings, effects, f) <= LEAST:
