@@ -54,6 +54,19 @@ def test_a_column_that_is_fixed_is_added_as_it_is():
     assert rest.step == pytest.approx(free.step - 1.0, abs=2e-2)
 
 
+def test_a_parameter_is_held_at_a_value_as_a_fit_ends_at_a_bound():
+    y = 0.4 - 0.7 * T + np.random.default_rng(5).standard_normal(N)
+    parameters = [Parameter("offset", 0.0, 2.0), Parameter("slope", 0.0, 2.0, low=0.0)]
+    f = fit(lambda values: {"y": y - values["offset"] - values["slope"] * T}, parameters)
+    assert f.values["slope"] == 0.0
+    sets = LinearSets({"y": np.vstack([-COLUMNS, y])}, {"y": f.ess["y"] / N})
+    found = sets.solve((0, 1), np.full(2, 2.0), (), np.zeros(2), np.eye(2), {1: 0.0})
+    assert 2.0 * found.step == pytest.approx([f.values["offset"], 0.0], abs=2e-2)
+    below = sets.solve((0,), np.full(1, 2.0), (), np.zeros(1), np.eye(1)).log_evidence
+    assert found.log_evidence - below == pytest.approx(f.log_occam(f.ess) - fit(
+        lambda values: {"y": y - values["offset"]}, parameters[:1]).log_occam(f.ess), abs=0.2)
+
+
 @pytest.fixture(scope="module")
 def chains():
     """A rig whose thrust lags, and whose arm has drag."""
@@ -82,6 +95,17 @@ def test_the_linear_model_predicts_the_fit_of_a_set(chains):
     members, there = linear.most_promising(set())
     assert {"thrust_lag", "quadratic_drag"} <= names(members)
     assert there.values["quadratic_drag.k"] == pytest.approx(0.3, rel=0.2)
+
+
+def test_an_effect_whose_fit_ended_at_its_bound_is_no_reason_for_an_infinite_evidence(chains):
+    findings, nominal, candidates = found_alone(chains, "thrust_lag", "quadratic_drag", "coulomb_friction")
+    assert findings.final.values["coulomb_friction.accel"] == 0.0
+    linear = LinearStage(chains, findings, nominal, candidates)
+    here = linear.predicted(linear.found)
+    assert here.values["coulomb_friction.accel"] == 0.0
+    fewer = [linear.predicted(tuple(m for m in linear.found if m is not gone)).log_evidence for gone in linear.found]
+    assert np.isfinite([here.log_evidence, *fewer]).all()
+    assert fewer[2] > here.log_evidence > max(fewer[:2])
 
 
 def test_effects_that_stand_in_for_others_give_way_to_them(chains):

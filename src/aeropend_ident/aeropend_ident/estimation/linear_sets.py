@@ -24,6 +24,9 @@ Array = NDArray[np.float64]
 STEPS = 8
 """Steps in which the noise of the bands is renewed at most (choice: more count only for sets that explain little)."""
 
+HELD = 1e12
+"""Information of a parameter that is held, in standard units (choice: far above that of any recording)."""
+
 SETTLED = 0.02
 """[nats] Change of the log likelihood between steps at which they end (choice: far less than decides)."""
 
@@ -59,7 +62,8 @@ class LinearSets:
                 weights.append(weight[channel])
         self.count, self.products, self.weight = np.array(counts, float), np.array(products), np.array(weights)
 
-    def solve(self, columns: Sequence[int], unit: Array, fixed: Sequence[int], mean: Array, prior: Array) -> Solution:
+    def solve(self, columns: Sequence[int], unit: Array, fixed: Sequence[int], mean: Array, prior: Array,
+              held: Mapping[int, float] | None = None) -> Solution:
         """The MAP estimate of a subset; the noise of a band is what it leaves there, but at least a reading's.
 
         Args:
@@ -68,9 +72,13 @@ class LinearSets:
             fixed: indices of columns that are added as they are.
             mean: (P,) means of the prior of the parameters.
             prior: (P, P) its information matrix.
+            held: index of a parameter -> value at which it is held, as at the bound of its range.
         """
+        stiff, center = prior.copy(), mean.copy()
+        for j, x in (held or {}).items():
+            stiff[j], stiff[:, j], stiff[j, j], center[j] = 0.0, 0.0, HELD, x
         at, of = np.array(columns, np.intp), np.array([*fixed, -1], np.intp) % self.products.shape[1]
-        step, inner, likelihood = _estimate(self.products, self.count, self.weight, at, unit, of, prior, prior @ mean,
+        step, inner, likelihood = _estimate(self.products, self.count, self.weight, at, unit, of, stiff, stiff @ center,
                                             STEPS, SETTLED)
         information, off = inner + prior, step - mean
         occam = 0.5 * float(np.linalg.slogdet(prior)[1] - off @ prior @ off - np.linalg.slogdet(information)[1])

@@ -212,17 +212,21 @@ class LinearStage:
         unit = np.array([p.slope(x) for p, x in zip(parameters, z, strict=True)])
         fixed = [column for name, column in self._removed.items()
                  if column is not None and all(m.hypothesis.name != name for m in members)]
-        step, log_evidence = self._linear.solve([t.column for t in terms.values()], unit, fixed, -z,
-                                                prior_information(parameters))
-        values = {p.name: p.value(x) for p, x in zip(parameters, z + step, strict=True)}
-        for m in members:
-            if m.terms[0].parameter.name not in {p.name for p in m.hypothesis.own}:
-                values = from_linear(m.hypothesis.effect, values)
-            values = {**m.beside, **values}
-        own = [p for m in members for p in m.hypothesis.own]
-        if any(not m.hypothesis.own[0].low <= values[m.hypothesis.own[0].name] <= m.hypothesis.own[0].high
-               for m in members):
-            return Predicted(-np.inf, {})
+        columns, prior = [t.column for t in terms.values()], prior_information(parameters)
+        own, sizes = [p for m in members for p in m.hypothesis.own], [m.hypothesis.own[0] for m in members]
+        held: dict[int, float] = {}
+        while True:
+            step, log_evidence = self._linear.solve(columns, unit, fixed, -z, prior, held)
+            values = _values_of(members, {p.name: p.value(x) for p, x in zip(parameters, z + step, strict=True)})
+            beyond = {p.name: p for p in sizes if not p.low <= values[p.name] <= p.high}
+            new = [j for j, name in enumerate(terms) if name in beyond and j not in held]
+            if any(all(m is not one for one in self.found) for m in members if m.hypothesis.own[0].name in beyond):
+                return Predicted(-np.inf, {})
+            if not new:
+                break
+            for j in new:  # a fit of what was found ends at the bound
+                p = parameters[j]
+                held[j] = p.to_standard(min(max(values[p.name], p.low), p.high)) - z[j]
         ends = {p.name: p for p in (*parameters, *own)}
         within = {n: min(max(v, ends[n].low), ends[n].high) for n, v in values.items()}
         return Predicted(log_evidence + sum(m.hypothesis.log_odds for m in members), within)
@@ -261,6 +265,15 @@ class LinearStage:
             if members is here or top.log_evidence <= least:
                 return None if here is self.found else (here, best)
             here, best, least = members, top, top.log_evidence + LEAST
+
+
+def _values_of(members: Set, values: dict[str, float]) -> dict[str, float]:
+    """All values of a set, from those that the linear model estimates."""
+    for m in members:
+        if m.terms[0].parameter.name not in {p.name for p in m.hypothesis.own}:
+            values = from_linear(m.hypothesis.effect, values)
+        values = {**m.beside, **values}
+    return values
 
 
 def compared(chains: CutChains, findings: Findings, nominal: Sequence[Parameter], candidates: Sequence[Hypothesis],
