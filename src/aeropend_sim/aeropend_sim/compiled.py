@@ -155,8 +155,8 @@ class _Cache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load the compiled code of a signature.
 
-        numba first loads all that its compiler knows, which takes half of a node's start-up. Code from the cache needs
-        nothing of it but the functions that manage memory.
+        numba first loads all that its compiler knows, which takes a third of a node's start-up. Of that, code from the
+        cache needs only the functions that manage memory.
         """
         rtsys.initialize(target_context)
         with self._guard_against_spurious_io_errors():
