@@ -64,7 +64,6 @@ def test_every_command_has_its_layout():
 
 
 @given(samples)
-@settings(deadline=None)
 def test_samples_come_back(sample):
     receiver, got = opened(frame(packed(sample)))
     assert got == [sample]
@@ -186,7 +185,6 @@ def test_fuzzed_streams_neither_crash_nor_pile_up(chunks):
 
 
 @given(st.lists(samples, min_size=1, max_size=10), st.randoms(use_true_random=False))
-@settings(deadline=None)
 def test_how_the_bytes_are_cut_does_not_matter(sent, rng):
     wire = b"".join(frame(packed(sample)) for sample in sent)
     cuts = sorted(rng.randrange(len(wire) + 1) for _ in range(20))
@@ -195,6 +193,5 @@ def test_how_the_bytes_are_cut_does_not_matter(sent, rng):
 
 
 @given(st.binary(min_size=1, max_size=40))
-@settings(deadline=None)
 def test_any_payload_parses_or_is_refused(payload):
     parse(payload)
