@@ -355,10 +355,9 @@ def _closing_as_much(chains: CutChains, findings: Findings, before: Fit, first: 
         fits = [refit(chains, stage, [*beside, r.hypothesis],
                       {**now, **{p.name: r.fit.values[p.name] for p in r.hypothesis.own}}) for r in rivals]
         before = refit(chains, stage, beside, now) if rivals else before
-    closed = squared_gap(chains, best, CHANNELS_OF[stage])
-    most = min(MATERIAL_SHARE * (squared_gap(chains, before, CHANNELS_OF[stage]) - closed), closed)
-    return {r.hypothesis.name for r, f in zip(rivals, fits, strict=True)
-            if squared_gap(chains, f, CHANNELS_OF[stage]) - closed < most}
+    open_, least, *left = (squared_gap(chains, f, CHANNELS_OF[stage]) for f in (before, best, *fits))
+    alike = min(MATERIAL_SHARE * (open_ - least), least)
+    return {r.hypothesis.name for r, x in zip(rivals, left, strict=True) if x - least < alike}
 
 
 def sets(findings: Mapping[str, Findings]) -> tuple[EffectSet, ...]:

@@ -214,13 +214,14 @@ class LinearStage:
                  if column is not None and all(m.hypothesis.name != name for m in members)]
         columns, prior = [t.column for t in terms.values()], prior_information(parameters)
         own, sizes = [p for m in members for p in m.hypothesis.own], [m.hypothesis.own[0] for m in members]
+        found = {m.hypothesis.own[0].name for m in members if any(m is one for one in self.found)}
         held: dict[int, float] = {}
         while True:
             step, log_evidence = self._linear.solve(columns, unit, fixed, -z, prior, held)
             values = _values_of(members, {p.name: p.value(x) for p, x in zip(parameters, z + step, strict=True)})
             beyond = {p.name: p for p in sizes if not p.low <= values[p.name] <= p.high}
             new = [j for j, name in enumerate(terms) if name in beyond and j not in held]
-            if any(all(m is not one for one in self.found) for m in members if m.hypothesis.own[0].name in beyond):
+            if not beyond.keys() <= found:
                 return Predicted(-np.inf, {})
             if not new:
                 break
