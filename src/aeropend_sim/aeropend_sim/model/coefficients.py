@@ -97,7 +97,7 @@ def rates(n: Mapping[str, float], e: Values | None, added: Terms | None, period:
     The factors (0.04, 0.02, 0.1, 0.3) are choices; the tests compare the result with scipy's integrators for fast
     plants.
     """
-    top_speed = float(actuator.voltage(n, 1.0)) / n["K_e"]  # rad/s, never reached
+    top_speed = float(actuator.speed_at(n, actuator.voltage(n, 1.0)))
     back = n["K_t"] * n["K_e"] / (n["J_m"] * n["L_a"])  # 1/s²: the speed acts back on itself through the winding
     motor = [min(math.sqrt(back / 0.04), back * n["L_a"] / (0.02 * n["R_a"])),
              2.0 * n["k_load"] * top_speed / n["J_m"] / 0.1]
