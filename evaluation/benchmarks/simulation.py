@@ -206,7 +206,7 @@ full = model.with_effects({i: {n: p.default for n, p in e.parameters.items()} fo
 for one in (model, full):
     rig.record(one, duty)
     prepared = prepare(one)
-    dynamics.run_arm(duty, State(), *prepared, np.empty((2, 10)))
+    dynamics.swing(one, duty, State())
     dynamics.run_motor(duty, State(), *prepared, np.empty((3, 10)))
 ensemble.squared_errors([model], duty, np.zeros((4, 10)))
 print(imported - start, time.process_time() - imported)

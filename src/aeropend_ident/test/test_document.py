@@ -18,7 +18,6 @@ from aeropend_ident.diagnosis.results import document as document_of
 from aeropend_ident.signals.from_bag import from_uncalibrated
 from aeropend_ident.testing.rigs import BENCH, recorded
 from aeropend_sim.model import dynamics
-from aeropend_sim.model.coefficients import prepare
 from aeropend_sim.model.parameters import Model
 from aeropend_sim.model.state import State
 
@@ -27,9 +26,8 @@ def free_decay(first, rate=20.0, every=5):
     """Readings of the angle of an arm that is let go and left alone for 8 s."""
     model = Model("arm", {**BENCH.model, "mgd_over_J": 40.0, "c_over_J": 0.4}, BENCH.sensing, {})
     n = round(8.0 * rate) * every + 1
-    out = np.empty((2, n))
-    dynamics.run_arm(np.zeros(n), State(theta=first), 1, *prepare(model, 1.0 / rate / every), out)
-    theta = out[0, ::every] + 1e-3 * np.random.default_rng(1).standard_normal(n // every + 1)
+    swung = dynamics.swing(model, np.zeros(n), State(theta=first), 1.0 / rate / every)[0]
+    theta = swung[::every] + 1e-3 * np.random.default_rng(1).standard_normal(n // every + 1)
     stamps = np.rint(np.arange(len(theta)) * 1e9 / rate).astype(np.int64)
     nothing, no_time = np.full(len(theta), np.nan), np.empty(0, np.int64)
     read = Recording(path="bag", namespace="/", stamp_ns=stamps, received_ns=stamps, t=stamps / 1e9, theta=theta,

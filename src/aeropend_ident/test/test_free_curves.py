@@ -22,7 +22,7 @@ from aeropend_ident.signals.signals import from_arrays
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import rig
 from aeropend_sim.model.coefficients import prepare
-from aeropend_sim.model.dynamics import run_arm, run_motor
+from aeropend_sim.model.dynamics import run_motor, swing
 from aeropend_sim.model.parameters import SAMPLE_PERIOD
 from aeropend_sim.model.state import State
 
@@ -146,13 +146,11 @@ def test_arm_answers_a_small_torque_as_the_simulation_does():
     small = 1e-4
     model = drawn_rig(1, {}, 0.0)
     heavier = model.with_effects({"cable_torque": {"k": small, "theta0": 0.0}})
-    out = np.empty((2, 2, 2000))
-    for k, m in enumerate((model, heavier)):
-        run_arm(speed, State(omega=150.0, thrust=BENCH.model["k_thrust"] * 150.0**2), 1, *prepare(m), out[k])
-    theta = out[0, 0]
+    begin = State(omega=150.0, thrust=BENCH.model["k_thrust"] * 150.0**2)
+    theta, there = (swing(m, speed, begin)[0] for m in (model, heavier))
     n = model.numbers()
     answer = arm_response(-small * theta[None, :], n["mgd_over_J"] * np.cos(theta), n["c_over_J"], 0.0, SAMPLE_PERIOD)
-    moved = out[1, 0] - out[0, 0]
+    moved = there - theta
     assert np.abs(answer[0] - moved).max() < 0.006 * np.abs(moved).max()
 
 

@@ -31,7 +31,6 @@ from aeropend_ident.signals.statistics import effective_sample_size
 from aeropend_ident.testing import bags
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
 from aeropend_sim.model import dynamics, rig
-from aeropend_sim.model.coefficients import prepare
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
 from aeropend_sim.model.state import State
@@ -45,9 +44,8 @@ def let_go(seconds, effects=None, gravity=40.0, damping=0.4, first=1.0, rate=20.
     model = Model("arm", {**BENCH.model, "mgd_over_J": gravity, "c_over_J": damping}, BENCH.sensing, effects or {})
     every = 5
     n = round((seconds - held) * rate) * every + 1
-    out = np.empty((2, n))
-    dynamics.run_arm(np.zeros(n), State(theta=first), 1, *prepare(model, 1.0 / rate / every), out)
-    theta = np.concatenate([np.full(round(held * rate), first), out[0, ::every]]) + zero
+    swung = dynamics.swing(model, np.zeros(n), State(theta=first), 1.0 / rate / every)[0]
+    theta = np.concatenate([np.full(round(held * rate), first), swung[::every]]) + zero
     theta = theta + 0.2 * lsb * np.random.default_rng(seed).standard_normal(len(theta))
     return np.arange(len(theta)) / rate, np.round(theta / lsb) * lsb if lsb else theta
 

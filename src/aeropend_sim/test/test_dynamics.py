@@ -377,7 +377,7 @@ def test_motor_alone_and_arm_alone_are_the_parts_of_the_whole(period):
     motor, arm = np.empty((3, len(duty))), np.empty((2, len(duty)))
     dynamics.run_motor(whole.v_a, State(), *prepared, motor)
     assert np.array_equal(motor, [whole.i_a, whole.omega, whole.rotor_angle])
-    dynamics.run_arm(whole.omega, State(), 1, *prepared, arm)
+    dynamics.run_arm(whole.omega, State(), 1, *prepared, (prepared[0], prepared[2]), arm)
     coarse = 30.0 * (period / 0.02)**2  # the speed is a straight line between samples
     assert np.abs(arm[0] - whole.theta).max() < 1e-3 * coarse * np.ptp(whole.theta)
 
@@ -388,8 +388,8 @@ def test_an_arm_that_takes_longer_steps_swings_the_same(effects):
     model, duty = load("bench").with_effects(defaults(*effects)), duty_for(SAMPLE_PERIOD)
     speed, state = simulate(model, duty).omega, State(theta=0.2, theta_dot=-0.5)
     theta, rate, after = dynamics.swing(model, speed, state)
-    each = np.empty((2, len(duty)))
-    exact = dynamics.run_arm(speed, state, 1, *prepare(model), each)
+    each, prepared = np.empty((2, len(duty))), prepare(model)
+    exact = dynamics.run_arm(speed, state, 1, *prepared, (prepared[0], prepared[2]) if effects else None, each)
     assert np.abs(theta - each[0]).max() < 1e-5 * np.ptp(theta)
     assert np.abs(rate - each[1]).max() < 1e-4 * np.ptp(rate)
     assert after.theta == pytest.approx(exact.theta, abs=1e-5)

@@ -134,7 +134,7 @@ def test_the_stages_of_the_chain_alone_agree_with_the_whole():
     whole, prepared = simulate(model, DUTY), prepare(model)
     motor, arm = np.empty((3, len(DUTY))), np.empty((2, len(DUTY)))
     dynamics.run_motor(whole.v_a, State(), *prepared, motor)
-    dynamics.run_arm(whole.omega, State(), 1, *prepared, arm)
+    dynamics.run_arm(whole.omega, State(), 1, *prepared, (prepared[0], prepared[2]), arm)
     assert motor[1] == pytest.approx(whole.omega, abs=1e-9)
     assert arm[0] == pytest.approx(whole.theta, abs=2e-4)
 

@@ -70,6 +70,14 @@ def arm_terms(motion: Motion, f: float, w: float, direction: float, p: Past, c: 
 
 
 @equation
+def has_dry_friction(e: Values | None, added: Terms | None) -> bool:
+    """Whether dry friction acts on the arm."""
+    if added is not None and added.arm_friction > added.rotor_friction:
+        return True
+    return e is not None and e.coulomb_friction_accel > 0.0
+
+
+@equation
 def grip(theta: float, f: float, w: float, past: Pasts | None, e: Values, added: Terms | None) -> float:
     """[rad/s²] Dry friction of the arm at rest, over its inertia."""
     limit = e.coulomb_friction_accel
@@ -320,10 +328,7 @@ def advance_arm(state: State, wm: float, w1: float, past: Pasts | None, c: Coeff
         fm, f1 = (k.half_decay * f0 + k.u0 * s0 + k.u1 * sm + k.u2 * s1,
                   k.decay * f0 + k.w0 * s0 + k.w1 * sm + k.w2 * s1)
     motion = Motion(state.theta, state.theta_dot, state.flex, state.flex_dot)
-    sticks = e.coulomb_friction_accel > 0.0
-    if added is not None:
-        sticks = sticks or added.arm_friction > added.rotor_friction
-    if sticks:
+    if has_dry_friction(e, added):
         return arm_with_dry_friction(motion, Over(f0, fm, f1), speed, state.gust, past, c, e, x, added), f1
     return arm(motion, Over(f0, fm, f1), speed, 0.0, state.gust, past, c, e, x, added), f1
 

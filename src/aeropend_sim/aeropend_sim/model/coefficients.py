@@ -23,7 +23,9 @@ LONGEST_STEP = 2.5e-3
 """[s] Longest step. Measured: over a longer one the error exceeds 2e-5 of the range of each state of `bench`."""
 
 LONGEST_ARM_STEP = 10e-3
-"""[s] Longest step of the arm alone. Measured: the angle of `bench` then changes by at most 1e-5 of its range."""
+"""[s] Longest step of the arm alone while it does not reverse against dry friction.
+
+Measured: the angle of `bench` then changes by at most 1e-5 of its range."""
 
 SAMPLED = 64
 """Points at which the slopes of terms by formula are sampled. A choice."""
@@ -82,7 +84,12 @@ def steps_in(model: Model, period: float) -> int:
 
 
 def _steps_in(period: float, *rates: float) -> int:
-    return min(MOST_STEPS, math.ceil(period * max(1.0 / LONGEST_STEP, *rates) - 1e-9))
+    return steps_of(period, max(1.0 / LONGEST_STEP, *rates))
+
+
+def steps_of(period: float, rate: float) -> int:
+    """Number of steps of a hold [s] with at least so many steps in a second."""
+    return min(MOST_STEPS, math.ceil(period * rate - 1e-9))
 
 
 def model_parts(model: Model) -> tuple[Mapping[str, float], Values | None, Terms | None]:
@@ -109,8 +116,6 @@ def rates(n: Mapping[str, float], e: Values | None, added: Terms | None, period:
         damping = (n["c_over_J"] + n["L_over_J"] * e.axial_inflow_k * top_speed
                    + 2.0 * math.sqrt(e.quadratic_drag_k * (top_drive + 4.0 * e.gust_sigma)))  # at terminal speed
         arm_ += [math.sqrt((n["mgd_over_J"] + abs(e.cable_torque_k)) / free) / 0.3, damping / free / 0.3]
-        if e.coulomb_friction_accel > 0.0:  # a step is cut once where the motion reverses
-            arm_.append(1.0 / LONGEST_STEP)
         if e.mast_flex_coupling > 0.0:
             arm_ += [e.mast_flex_omega / math.sqrt(free) / 0.3,
                      2.0 * e.mast_flex_zeta * e.mast_flex_omega / free / 0.3]
@@ -118,7 +123,7 @@ def rates(n: Mapping[str, float], e: Values | None, added: Terms | None, period:
         most = MOST_TERM_STEPS / period
         rate, angle, rotor_ = (min(x / 0.3, most) for x in term_rates(n, top_speed, added))
         motor.append(rotor_)
-        arm_ += [rate, angle, 1.0 / LONGEST_STEP if added.arm_friction > added.rotor_friction else 0.0]
+        arm_ += [rate, angle]
     return max(motor), max(arm_)
 
 

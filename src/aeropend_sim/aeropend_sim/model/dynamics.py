@@ -10,6 +10,7 @@ For the nominal model the effects are None: numba then compiles the equations wi
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -17,16 +18,17 @@ from numpy.typing import NDArray
 
 from aeropend_sim.compiled import equation, njit
 from aeropend_sim.model import actuator
-from aeropend_sim.model.arm import advance_arm
+from aeropend_sim.model.arm import advance_arm, has_dry_friction
 from aeropend_sim.model.coefficients import (
     LONGEST_ARM_STEP,
-    MOST_STEPS,
+    LONGEST_STEP,
     Coefficients,
     Extra,
     model_parts,
     prepare,
     prepared,
     rates,
+    steps_of,
 )
 from aeropend_sim.model.effects import Values
 from aeropend_sim.model.motor import advance_motor, at_terminals
@@ -190,18 +192,28 @@ def swing(model: Model, speed: Array, state: State, period: float = SAMPLE_PERIO
     parts = model_parts(model)
     rate = max(rates(*parts, period)[1], 1.0 / LONGEST_ARM_STEP)
     out = np.empty((2, len(speed)))
-    every, done = math.floor(1.0 / (period * rate) + 1e-9), 0
+    every, done = max(math.floor(1.0 / (period * rate) + 1e-9), 1), 0
     if every > 1:
         done = (len(speed) - 1) // every * every
-        state = run_arm(speed[:done + 1], state, every, *prepared(*parts, every * period, 1), out[:, :done])
-    steps = min(MOST_STEPS, math.ceil(period * rate - 1e-9))
-    state = run_arm(speed[done:], state, 1, *prepared(*parts, period, steps), out[:, done:])
+        state = _swing(parts, speed[:done + 1], state, every, rate, period, out[:, :done])
+    state = _swing(parts, speed[done:], state, 1, rate, period, out[:, done:])
     return out[0], out[1], state
+
+
+def _swing(parts: tuple[Mapping[str, float], Values | None, Terms | None], speed: Array, state: State, every: int,
+           rate: float, period: float, out: Array) -> State:
+    """`run_arm` with steps that are short enough for a rate [1/s]."""
+    c, e, x, added = prepared(*parts, every * period, steps_of(every * period, rate))
+    short = None
+    if x is not None:
+        fine = prepared(*parts, period, steps_of(period, max(rate, 1.0 / LONGEST_STEP)))
+        short = fine[0], fine[2]
+    return run_arm(speed, state, every, c, e, x, added, short, out)
 
 
 @njit(nogil=True)
 def run_arm(speed: Array, state: State, every: int, c: Coefficients, e: Values | None, x: Extra | None,
-            added: Terms | None, out: Array) -> State:
+            added: Terms | None, short: tuple[Coefficients, Extra | None] | None, out: Array) -> State:
     """Air and arm alone, for a given speed of the rotor, linear between samples.
 
     Args:
@@ -212,6 +224,8 @@ def run_arm(speed: Array, state: State, every: int, c: Coefficients, e: Values |
         e: effects; None for the nominal plant.
         x: coefficients of the effects; None for the nominal plant.
         added: terms by formula; None without any.
+        short: coefficients of a hold of one sample in shorter steps, which are taken where the arm reverses against dry
+            friction or rests; None for the nominal plant.
         out: (2, M), filled with θ, θ̇: at N samples, or, if `every` is greater than 1, at N - 1, a multiple of it.
 
     Returns:
@@ -228,18 +242,37 @@ def run_arm(speed: Array, state: State, every: int, c: Coefficients, e: Values |
                 mean += speed[k + j]
             middle = 0.25 * (6.0 * mean / every - speed[k + every] - 5.0 * w)
         for _ in range(c.steps):
-            now = State(0.0, w, 0.0, state.theta, state.theta_dot, state.thrust, 0.0, state.flex, state.flex_dot, 0.0,
-                        state.time, state.memory)
-            past = None if added is None else pasts(now, 0.0, c, added)
-            m, f1 = advance_arm(now, w + middle, w + rise, past, c, e, x, added)
+            state = arm_after(state, w, w + middle, w + rise, c, e, x, added)
             w += rise
-            state = State(0.0, w, 0.0, m.theta, m.theta_dot, f1, 0.0, m.flex, m.flex_dot, 0.0, now.time, now.memory)
-            if added is not None and past is not None:
-                state = since(state, past_after(now, state, 0.0, past, c, added))
         out[0, k], out[1, k] = before.theta, before.theta_dot
-        for j in range(1, every):
-            out[0, k + j], out[1, k + j] = between(before, state, j / every, c.h)
+        if short is not None and short[0].h < c.h and before.theta_dot * state.theta_dot <= 0.0 and has_dry_friction(
+                e, added):
+            state = before
+            for j in range(every):
+                out[0, k + j], out[1, k + j] = state.theta, state.theta_dot
+                w = speed[k + j]
+                rise = (speed[min(k + j + 1, last)] - w) / short[0].steps
+                for _ in range(short[0].steps):
+                    state = arm_after(state, w, w + 0.5 * rise, w + rise, short[0], e, short[1], added)
+                    w += rise
+        else:
+            for j in range(1, every):
+                out[0, k + j], out[1, k + j] = between(before, state, j / every, c.h)
     return state
+
+
+@equation
+def arm_after(state: State, w0: float, wm: float, w1: float, c: Coefficients, e: Values | None, x: Extra | None,
+              added: Terms | None) -> State:
+    """Air and arm after one step, for a speed of the rotor at its start, middle and end."""
+    now = State(0.0, w0, 0.0, state.theta, state.theta_dot, state.thrust, 0.0, state.flex, state.flex_dot, 0.0,
+                state.time, state.memory)
+    past = None if added is None else pasts(now, 0.0, c, added)
+    m, f1 = advance_arm(now, wm, w1, past, c, e, x, added)
+    after = State(0.0, w1, 0.0, m.theta, m.theta_dot, f1, 0.0, m.flex, m.flex_dot, 0.0, now.time, now.memory)
+    if added is not None and past is not None:
+        after = since(after, past_after(now, after, 0.0, past, c, added))
+    return after
 
 
 @equation
