@@ -126,6 +126,7 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
         policy = policy_of(recordings, fit_nominal=fit_nominal)
         likely: dict[str, float] = {}
         plain = None
+        state: Mapping[str, float] = {}
         notes: tuple[str, ...] = ()
         if fit_nominal:
             progress("identifying the nominal model", 0.0)
@@ -133,14 +134,15 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
                 model = replace(model, model={**model.model, "reverse": 1.0})
             recordings = mounted(model, recordings)
         if policy.wide_search and angle_only(recordings):
-            rig = fit_driven_rig(model, recordings, deadline)
-            found, likely = without_findings(rig.model, model, recordings, material)
+            rig = fit_driven_rig(model, recordings, deadline, jobs)
+            found, likely = without_findings(rig, model, recordings, material)
             model, plain, notes = replace(found, name=f"{model.name}, identified"), rig.plain, rig.notes
+            state = rig.state
         elif fit_nominal:
             model, recordings = fit_nominal_model(model, recordings, deadline)
         kind = CutChains if policy.calibrated else CachedChains
         chains = with_pwm_timing(kind(model, recordings, policy))
-        chains.likely, chains.plain, chains.notes, chains.known = likely, plain, notes, known
+        chains.likely, chains.state, chains.plain, chains.notes, chains.known = likely, state, plain, notes, known
         chains.further, chains.left_out = tuple(further), tuple(left_out)
         return _diagnose(chains, Settings(jobs, material, deadline), progress)
 

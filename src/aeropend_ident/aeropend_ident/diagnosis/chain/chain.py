@@ -273,6 +273,7 @@ class CutChains:
     def __init__(self, model: Model, recordings: Sequence[Signals], policy: Policy = CALIBRATED) -> None:
         self.model, self.policy = model, policy
         self.likely: Mapping[str, float] = {}  # sizes of effects with which the parameters were identified
+        self.state: Mapping[str, float] = {}  # initial states from which fits start
         self.plain: Model | None = None  # the best nominal model without further terms, of a driven rig
         self.known: Known | None = None  # what earlier verdicts know of the rig
         self.further: tuple[str, ...] = ()  # ids of effects of effect files that are tried too
@@ -287,7 +288,7 @@ class CutChains:
             recordings: of the same rig.
         """
         out = type(self)(self.model, recordings, self.policy)
-        for name in ("likely", "plain", "known", "further", "left_out", "notes"):
+        for name in ("likely", "state", "plain", "known", "further", "left_out", "notes"):
             setattr(out, name, getattr(self, name))
         return out
 
@@ -348,6 +349,7 @@ class CutChains:
         """The chain of one recording alone."""
         out = copy(self)
         out.each = [self.each[k]]
+        out.state = {key(n).of(0): v for n, v in self.state.items() if key(n).recording == k}
         return out
 
     def set_next_input(self, stage: str, values: Values) -> None:

@@ -10,8 +10,10 @@ neither the scale of the duty nor that of time matters.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,11 +30,12 @@ from aeropend_ident.diagnosis.chain.priors import (
     refines,
     usual_size,
 )
-from aeropend_ident.diagnosis.chain.values import FILTER, absent_at, of_rig, with_values
+from aeropend_ident.diagnosis.chain.values import FILTER, absent_at, of_rig, states, with_values
 from aeropend_ident.diagnosis.chain.weak_start import WeakForm, downsampled, likeliest
 from aeropend_ident.diagnosis.document import Lift
 from aeropend_ident.diagnosis.policy import UNCALIBRATED
 from aeropend_ident.estimation.map_fit import ENOUGH, Fit, Search, Sensitivities, fit, passed
+from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import actuator
@@ -66,7 +69,10 @@ SHORTEST_HORIZON = 3.0
 """[s] Shortest horizon for the arm of the bench (choice: some swings)."""
 
 STEPS, ROUNDS = 8, 3
-"""Steps and rounds of the fits; the last fit goes on to its end (choice)."""
+"""Steps and rounds of the fits (choice)."""
+
+LAST_STEPS, LAST_ROUNDS = 4, 10
+"""The same of the last fit, which goes on to its end (choice)."""
 
 BLOCKS = 6
 """Blocks of time of a cross-validation in each recording (choice: each holds some swings)."""
@@ -115,6 +121,17 @@ class Units:
                    if e in DEFINED else dict(p) for e, p in m.effects.items()}
         return Model(m.name, numbers, {**m.sensing, tau: m.sensing[tau] * t}, effects)
 
+    def state_back(self, values: Mapping[str, float]) -> dict[str, float]:
+        """The initial states among values in these units, in SI units."""
+        return {n: v * self.time if key(n).name == "theta_dot" else v for n, v in states(values).items()}
+
+
+class Fitted(NamedTuple):
+    """A nominal model with the fit in which its parameters ended."""
+
+    model: Model
+    fit: Fit
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -132,37 +149,45 @@ class DrivenRig:
     Attributes:
         model: as identified.
         plain: the best one without any of the terms of `CHOSEN`.
+        state: initial states of the recordings, by name.
         notes: what the recordings do not tell.
     """
 
     model: Model
     plain: Model
+    state: Mapping[str, float]
     notes: tuple[str, ...] = ()
 
 
-def fit_driven_rig(model: Model, recordings: Sequence[Signals], deadline: float | None = None) -> DrivenRig:
+def fit_driven_rig(model: Model, recordings: Sequence[Signals], deadline: float | None = None, jobs: int = 1
+                   ) -> DrivenRig:
     """Identify the nominal model from angle and command.
 
     Args:
         model: gives what the recordings cannot determine.
         recordings: of one rig.
         deadline: [s] of `time.monotonic` after which no further term is looked for.
+        jobs: processes.
     """
     units = units_of(model, recordings)
-    scaled = [downsampled(units.of(s), LONGEST_STEP) for s in recordings]
     begun = units.model(model)
-    full, plain = _searched(begun, scaled, model.effects, deadline)
-    chosen = None if full is None else _chosen(full, scaled, model.effects, deadline)
+    scaled = [downsampled(units.of(s), LONGEST_STEP) for s in recordings]
+    search = _TermSearch(scaled, frozenset(model.effects), deadline, jobs)
+    full, plain = search.with_every_term(begun)
+    chosen = None if full is None else search.simplified(full)
+    if chosen is not None:
+        chosen = search.refined(begun, chosen)
+    best = chosen or plain
+    begun = units.model(best.model, back=True)
+    found, f = _fitted(begun, recordings, LAST_ROUNDS, LAST_STEPS, deadline)
+    if f.mean_square > NEEDED * best.fit.mean_square and not passed(deadline):  # an arm that sticks at once stays so
+        state = units.state_back(best.fit.values)
+        found, f = min((found, f), _fitted(begun, recordings, LAST_ROUNDS, LAST_STEPS, deadline, state),
+                       key=lambda one: one[1].mean_square)
     if chosen is None:
-        found = units.model(plain, back=True)
-        f = fit_own(found, recordings, deadline=deadline)
-        found = with_values(found, of_rig(f.values))
-        return DrivenRig(found, found, (PLAIN,))
-    chosen = _refined(begun, chosen, scaled, model.effects, deadline)
-    found = units.model(chosen.model, back=True)
-    f = fit_own(found, recordings, deadline=deadline)
-    notes = () if passed(deadline) else _delay_or_lag(chosen, scaled, keep=model.effects)
-    return DrivenRig(with_values(found, of_rig(f.values)), _rescaled(units.model(plain, back=True), found), notes)
+        return DrivenRig(found, found, states(f.values), (PLAIN,))
+    notes = () if passed(deadline) else search.delay_or_lag(chosen)
+    return DrivenRig(found, _rescaled(units.model(plain.model, back=True), found), states(f.values), notes)
 
 
 def _rescaled(plain: Model, found: Model) -> Model:
@@ -173,28 +198,29 @@ def _rescaled(plain: Model, found: Model) -> Model:
                                  "L_over_J": n["L_over_J"] / a**2})
 
 
-def without_findings(model: Model, given: Model, recordings: Sequence[Signals], material: float
+def without_findings(rig: DrivenRig, given: Model, recordings: Sequence[Signals], material: float
                      ) -> tuple[Model, dict[str, float]]:
     """The nominal model without dry friction, which is a finding as it is in a free decay, and the size that it has.
 
     Dry friction that does not bring the model closer to the unseen part is no finding, but stays part of the model.
 
     Args:
-        model: as identified.
+        rig: as identified.
         given: the model before; what it holds is known to be there.
         recordings: of the rig.
         material: share of the squared gap from which an effect is a finding.
     """
+    model = rig.model
     names = [e for e in FINDINGS if e in model.effects and e not in given.effects]
     fewer = model.with_effects({e: p for e, p in model.effects.items() if e not in names})
-    if not names or _unseen(model, recordings) > (1.0 - material) * _unseen(fewer, recordings):
+    if not names or _unseen(model, recordings, rig.state) > (1.0 - material) * _unseen(fewer, recordings, rig.state):
         return model, {}
     return fewer, {f"{e}.{n}": v for e in names for n, v in model.effects[e].items()}
 
 
-def _unseen(model: Model, recordings: Sequence[Signals]) -> float:
+def _unseen(model: Model, recordings: Sequence[Signals], state: Mapping[str, float]) -> float:
     """Sum of squares, in units of a reading's noise, of free runs over the parts that nothing was fitted to."""
-    values = fit_own(model, recordings).values
+    values = fit_own(model, recordings, state=state).values
     chains = CachedChains(model, recordings, UNCALIBRATED)
     total = 0.0
     for k, (chain, s) in enumerate(zip(chains.each, recordings, strict=True)):
@@ -225,42 +251,6 @@ def units_of(model: Model, recordings: Sequence[Signals]) -> Units:
     return Units(min(found)[1] if found else 1.0, duty)
 
 
-def _searched(model: Model, recordings: Sequence[Signals], keep: Collection[str], deadline: float | None
-              ) -> tuple[Candidate | None, Model]:
-    """The best fit with every term, None if there is no time for it; and the best model without any.
-
-    Fits start from each lag, with and without dry friction, over growing horizons.
-    """
-    coarse = [downsampled(s) for s in recordings]
-    tests = [WeakForm(s) for s in coarse]
-    kinds = (False, True) if "coulomb_friction" not in keep else (False,)
-    starts = [likeliest(model, coarse, tests, friction=friction) for friction in kinds]
-    begun: list[Model] = []
-    for found in starts:
-        best = {s.lag: s.model for s in reversed(found)}
-        if best and not (begun and passed(deadline)):
-            begun.append(_over_growing_horizons(list(best.values()), recordings, deadline))
-    plain = _fitted(begun[0] if starts[0] else model, recordings, ROUNDS, STEPS, deadline)[0]
-    if passed(deadline):
-        return None, plain
-    begun = [plain, *begun[1 if starts[0] else 0:]]
-    full = [_with_terms(m, [n for n in CHOSEN if not refines(n)]) for m in begun]
-    m, f = min((_fitted(m, recordings, ROUNDS, STEPS, deadline) for m in full), key=lambda e: e[1].mean_square)
-    return None if passed(deadline) else Candidate(m, f, _error(m, recordings, f)), plain
-
-
-def _over_growing_horizons(begun: list[Model], recordings: Sequence[Signals], deadline: float | None) -> Model:
-    """The best of some starts after fits over the beginning, then over more and more, while there is time."""
-    for share, many in zip(HORIZONS, FOLLOWED, strict=True):
-        least = round(SHORTEST_HORIZON / recordings[0].period)
-        part = [replace(s, train=min(max(round(share * s.train), least), s.train)) for s in recordings]
-        if passed(deadline):
-            break
-        fits = sorted((_fitted(m, part, 2, STEPS, deadline) for m in begun), key=lambda f: f[1].mean_square)
-        begun = [m for m, _ in fits[:many]]
-    return begun[0]
-
-
 def _usual(name: str, m: Model) -> float:
     """By how much a term usually differs from the value at which it is absent."""
     return 1.0 if refines(name) else usual_size(key(name).owner, m) - absent_at(name)
@@ -276,24 +266,119 @@ def _with_terms(m: Model, names: Sequence[str]) -> Model:
     return with_values(m, {n: _first_size(n, m) for n in names if key(n).owner not in m.effects or refines(n)})
 
 
-def _refined(model: Model, best: Candidate, recordings: Sequence[Signals], keep: Collection[str],
-             deadline: float | None) -> Candidate:
-    """Add what refines a term, with that term, where a cross-validated free run needs it.
+@dataclass(frozen=True)
+class _TermSearch:
+    """The search for the terms of the nominal model.
 
-    All else is then searched again: without it, the static curve had to stand in for it.
+    Attributes:
+        recordings: of one rig, in its `Units`.
+        keep: ids of effects that the model holds in any case.
+        deadline: [s] of `time.monotonic` after which no further term is looked for.
+        jobs: processes.
     """
-    for name in filter(refines, CHOSEN):
-        owner = key(name).owner
-        terms = [f"{owner}.{DEFINED[owner].size}", name]
-        if owner in keep or passed(deadline):
-            continue
-        tried = _candidate(_with_terms(best.model, terms), recordings)
-        if best.error > NEEDED * tried.error and not any(_absent(tried, term) for term in terms):
-            begun = model.with_effects({**model.effects, owner: tried.model.effects[owner]})
-            full = _searched(begun, recordings, keep, deadline)[0]
-            again = None if full is None else _chosen(full, recordings, keep, deadline)
-            best = min((c for c in (tried, again) if c is not None), key=lambda c: c.error)
-    return best
+
+    recordings: Sequence[Signals]
+    keep: frozenset[str]
+    deadline: float | None
+    jobs: int
+
+    def with_every_term(self, model: Model) -> tuple[Candidate | None, Fitted]:
+        """The best fit with every term, None if there is no time for it; and the best one without any.
+
+        Fits start from each lag, with and without dry friction, over growing horizons.
+        """
+        coarse = [downsampled(s) for s in self.recordings]
+        tests = [WeakForm(s) for s in coarse]
+        kinds = (False, True) if "coulomb_friction" not in self.keep else (False,)
+        starts = [likeliest(model, coarse, tests, friction=friction) for friction in kinds]
+        begun: list[Fitted] = []
+        for found in starts:
+            best = {s.lag: s.model for s in reversed(found)}
+            if best and not (begun and passed(self.deadline)):
+                begun.append(self._over_growing_horizons(list(best.values())))
+        plain = self._fitted(begun[0].model if starts[0] else model)
+        if passed(self.deadline):
+            return None, plain
+        begun = [plain, *begun[1 if starts[0] else 0:]]
+        full = [_with_terms(one.model, [n for n in CHOSEN if not refines(n)]) for one in begun]
+        most = min(parallel(self.jobs, self._fitted, full), key=lambda one: one.fit.mean_square)
+        return None if passed(self.deadline) else self._judged(most), plain
+
+    def _over_growing_horizons(self, models: Sequence[Model]) -> Fitted:
+        """The best of some starts after fits over the beginning, then over more and more, while there is time."""
+        least = round(SHORTEST_HORIZON / self.recordings[0].period)
+        fits: list[Fitted] = []
+        for share, many in zip(HORIZONS, FOLLOWED, strict=True):
+            if fits and passed(self.deadline):
+                break
+            part = [replace(s, train=min(max(round(share * s.train), least), s.train)) for s in self.recordings]
+            fits = sorted(parallel(self.jobs, partial(self._over, part), models), key=lambda one: one.fit.mean_square)
+            models = [one.model for one in fits[:many]]
+        return fits[0]
+
+    def _over(self, part: Sequence[Signals], model: Model) -> Fitted:
+        return _fitted(model, part, 2, STEPS, self.deadline)
+
+    def refined(self, model: Model, best: Candidate) -> Candidate:
+        """Add what refines a term, with that term, where a cross-validated free run needs it.
+
+        All else is then searched again: without it, the static curve had to stand in for it.
+        """
+        for name in filter(refines, CHOSEN):
+            owner = key(name).owner
+            terms = [f"{owner}.{DEFINED[owner].size}", name]
+            if owner in self.keep or passed(self.deadline):
+                continue
+            tried = self._candidate(_with_terms(best.model, terms))
+            if best.error > NEEDED * tried.error and not any(_absent(tried, term) for term in terms):
+                begun = model.with_effects({**model.effects, owner: tried.model.effects[owner]})
+                full = self.with_every_term(begun)[0]
+                again = None if full is None else self.simplified(full)
+                best = min((c for c in (tried, again) if c is not None), key=lambda c: c.error)
+        return best
+
+    def simplified(self, best: Candidate) -> Candidate | None:
+        """Take out the terms that a cross-validated free run does not need, the least needed first; None: no time."""
+        while not passed(self.deadline):
+            terms = [name for name in held(best.model) if key(name).owner not in self.keep]
+            gone = [name for name in terms if _absent(best, name)]
+            fewer = parallel(self.jobs, partial(self._without, best), gone[:1] or terms)
+            simpler = min(fewer, key=lambda c: c.error, default=None)
+            if simpler is None or (simpler.error > NEEDED * best.error and not gone):
+                return best
+            best = simpler
+        return None
+
+    def delay_or_lag(self, best: Candidate) -> tuple[str, ...]:
+        """A note if the recordings do not tell whether a transport delay or a second lag puts the lift off."""
+        here = [e for e in LAGS if e in best.model.effects]
+        if len(here) != 1 or here[0] in self.keep:
+            return ()
+        (other,) = (e for e in LAGS if e not in here)
+        effects = {e: p for e, p in best.model.effects.items() if e not in here}
+        as_long = {LAGS[other]: best.model.effect(here[0], LAGS[here[0]])}
+        f = fit_own(best.model.with_effects({**effects, other: as_long}), self.recordings, ROUNDS, STEPS)
+        if expit(f.evidence_over(best.fit)) < UNCALIBRATED.undecided:
+            return ()
+        said = (f"the recordings do not tell {here[0]}, which the identified model holds, from {other}: in its place "
+                "that explains the angle about as well; steps of the command tell them apart best")
+        return (said,)
+
+    def _without(self, c: Candidate, name: str) -> Candidate:
+        k = key(name)
+        effects = {e: p for e, p in c.model.effects.items() if e != k.owner or DEFINED[e].size != k.name}
+        if k.owner in effects:
+            effects[k.owner] = {**effects[k.owner], k.name: absent_at(name)}
+        return self._candidate(c.model.with_effects(effects))
+
+    def _fitted(self, model: Model) -> Fitted:
+        return _fitted(model, self.recordings, ROUNDS, STEPS, self.deadline)
+
+    def _candidate(self, model: Model) -> Candidate:
+        return self._judged(_fitted(model, self.recordings, ROUNDS, STEPS))
+
+    def _judged(self, one: Fitted) -> Candidate:
+        return Candidate(*one, _error(one.model, self.recordings, one.fit))
 
 
 def _absent(c: Candidate, name: str) -> bool:
@@ -302,59 +387,17 @@ def _absent(c: Candidate, name: str) -> bool:
     return abs(size - absent_at(name)) < NOTHING * abs(_usual(name, c.model))
 
 
-def _chosen(best: Candidate, recordings: Sequence[Signals], keep: Collection[str], deadline: float | None
-            ) -> Candidate | None:
-    """Take out the terms that a cross-validated free run does not need, the least needed first; None: no time."""
-    while not passed(deadline):
-        terms = [name for name in held(best.model) if key(name).owner not in keep]
-        gone = [name for name in terms if _absent(best, name)]
-        fewer = [_without(best, recordings, name) for name in gone[:1] or terms]
-        simpler = min(fewer, key=lambda c: c.error, default=None)
-        if simpler is None or (simpler.error > NEEDED * best.error and not gone):
-            return best
-        best = simpler
-    return None
+def _fitted(model: Model, recordings: Sequence[Signals], rounds: int, steps: int, deadline: float | None = None,
+            state: Mapping[str, float] | None = None) -> Fitted:
+    f = fit_own(model, recordings, rounds, steps, deadline, state)
+    return Fitted(with_values(model, of_rig(f.values)), f)
 
 
-def _delay_or_lag(best: Candidate, recordings: Sequence[Signals], keep: Collection[str]) -> tuple[str, ...]:
-    """A note if the recordings do not tell whether a transport delay or a second lag puts the lift off."""
-    here = [e for e in LAGS if e in best.model.effects]
-    if len(here) != 1 or here[0] in keep:
-        return ()
-    (other,) = (e for e in LAGS if e not in here)
-    effects = {e: p for e, p in best.model.effects.items() if e not in here}
-    as_long = {LAGS[other]: best.model.effect(here[0], LAGS[here[0]])}
-    f = fit_own(best.model.with_effects({**effects, other: as_long}), recordings, ROUNDS, STEPS)
-    if expit(f.evidence_over(best.fit)) < UNCALIBRATED.undecided:
-        return ()
-    said = (f"the recordings do not tell {here[0]}, which the identified model holds, from {other}: in its place that "
-            "explains the angle about as well; steps of the command tell them apart best")
-    return (said,)
-
-
-def _without(c: Candidate, recordings: Sequence[Signals], name: str) -> Candidate:
-    k = key(name)
-    effects = {e: p for e, p in c.model.effects.items() if e != k.owner or DEFINED[e].size != k.name}
-    if k.owner in effects:
-        effects[k.owner] = {**effects[k.owner], k.name: absent_at(name)}
-    return _candidate(c.model.with_effects(effects), recordings)
-
-
-def _candidate(model: Model, recordings: Sequence[Signals]) -> Candidate:
-    m, f = _fitted(model, recordings, ROUNDS, STEPS)
-    return Candidate(m, f, _error(m, recordings, f))
-
-
-def _fitted(model: Model, recordings: Sequence[Signals], rounds: int, steps: int, deadline: float | None = None
-            ) -> tuple[Model, Fit]:
-    f = fit_own(model, recordings, rounds, steps, deadline)
-    return with_values(model, of_rig(f.values)), f
-
-
-def fit_own(model: Model, recordings: Sequence[Signals], rounds: int = 10, steps: int = 4,
-            deadline: float | None = None) -> Fit:
-    """Fit the parameters of a nominal model, with those of the effects that it holds."""
+def fit_own(model: Model, recordings: Sequence[Signals], rounds: int = LAST_ROUNDS, steps: int = LAST_STEPS,
+            deadline: float | None = None, state: Mapping[str, float] | None = None) -> Fit:
+    """Fit the parameters of a nominal model, with those of the effects that it holds, from initial states."""
     chains = CachedChains(model, recordings, UNCALIBRATED)
+    chains.state = state or {}
     return fit(chains.residuals("arm"), nominal_parameters(chains, "arm"), rounds, steps, UNCALIBRATED.least_ess,
                deadline)
 

@@ -12,7 +12,7 @@ import numpy as np
 from aeropend_ident.diagnosis.chain.chain import DELAY, CutChains
 from aeropend_ident.diagnosis.chain.values import FILTER, STAGES, absent_at, limits
 from aeropend_ident.diagnosis.policy import angle_only, free_swinging
-from aeropend_ident.estimation.parameter import Parameter, key
+from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.signals import STILL, Signals
 from aeropend_sim.model import actuator
 from aeropend_sim.model.effects import DEFINED
@@ -188,7 +188,7 @@ def initial_states(chains: CutChains, stage: str) -> list[Parameter]:
         elif stage == "arm":
             start = float(np.mean(s.theta[np.isfinite(s.theta)][:10]))
             parameters += [Parameter(_initial("theta", k), start, 0.1), Parameter(_initial("theta_dot", k), 0.0, 1.0)]
-    return parameters
+    return started(parameters, chains.state)
 
 
 def _initial(state: str, recording: int) -> str:

@@ -114,6 +114,11 @@ def own_sensing(model: Model, recordings: Sequence[Signals]) -> dict[str, float]
     return own
 
 
+def states(values: Values) -> dict[str, float]:
+    """The initial states among values."""
+    return {n: v for n, v in values.items() if key(n).is_initial}
+
+
 def of_rig(values: Values) -> dict[str, float]:
     """The values that hold for the rig: without initial states; those that differ between recordings as their mean."""
     out: dict[str, list[float]] = {}

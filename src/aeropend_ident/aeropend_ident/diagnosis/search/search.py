@@ -261,15 +261,18 @@ def _beside(findings: Findings, nominal: list[Parameter], hypothesis: Hypothesis
 
 
 def _with_better_rivals(chains: CutChains, findings: Findings, nominal: list[Parameter]) -> Findings:
-    """Replace an effect found early by a close rival that fits better beside the effects found later."""
+    """Replace an effect found early by a close rival that fits better beside the effects found later.
+
+    It is looked again after a replacement: each raises the evidence, so this ends.
+    """
     if len(findings.found) < 2:
         return findings
-    for k in range(len(findings.found)):
-        for rival in _rivals(findings, k):
-            better = _swapped(chains, findings, nominal, k, rival)
-            if better is not None:
-                findings = better
-                break
+    before = None
+    while findings is not before:
+        before = findings
+        for k in range(len(findings.found)):
+            swaps = (_swapped(chains, findings, nominal, k, rival) for rival in _rivals(findings, k))
+            findings = next((better for better in swaps if better is not None), findings)
     return findings
 
 
