@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.diagnosis import diagnosis
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.free_run_gap import Gap
@@ -197,7 +198,7 @@ def test_the_most_harmful_effect_is_taken_out_alone_unless_the_gap_is_then_large
     totals = {frozenset("abc"): 5.0, frozenset("bc"): 4.0, frozenset("b"): 6.0}
 
     def measured(_fitted, found, _progress):
-        return found, None, SimpleNamespace(after=SimpleNamespace(total=totals[found]))
+        return found, None, SimpleNamespace(after=SimpleNamespace(total=totals[found], diverges=False))
 
     monkeypatch.setattr(diagnosis, "parts_of", lambda found, *_: [
         Part(name, "arm", amount, np.zeros(1)) for name, amount in amounts[found].items()])
@@ -225,6 +226,34 @@ def left(rms, floor, parts=()):
 def test_a_learned_term_is_kept_only_if_it_closes_materially_more(rms, closes_more):
     known = left(0.2, 0.0, [("cable_torque", 0.06), ("gust", -1.0)])
     assert left(rms, 0.0).closes_more(known, material=0.03) == closes_more
+
+
+def test_a_learned_term_with_which_the_run_diverges_is_not_kept():
+    known, diverging = left(6.0, 0.0), left(1e5, 0.0)
+    assert left(0.1, 0.0).closes_more(known, material=0.03)
+    diverging = diverging._replace(gaps=SimpleNamespace(after=replace(diverging.gaps.after, diverges=True)))
+    assert not diverging.closes_more(known, material=0.03)
+
+
+def test_effects_with_which_the_run_diverges_are_taken_out(monkeypatch):
+    def measured(_, found, __):
+        after = Gap({"theta": 1e5 if "b" in found else 3.0}, {"theta": 1.0}, np.full((1, 1), 9.0), "b" in found)
+        return found, None, SimpleNamespace(after=after)
+
+    monkeypatch.setattr(diagnosis, "_without", lambda found, name: found - {name})
+    monkeypatch.setattr(diagnosis, "parts_of", lambda found, *_: [
+        Part(name, "arm", 8.0, np.zeros(1)) for name in (*found, "")])
+    monkeypatch.setattr(diagnosis, "fit_and_measure", measured)
+    start = frozenset("ab")
+    found = diagnosis._without_harmful(None, start, None, measured(None, start, None)[2], Settings(), None).found
+    assert found == {"a"}
+
+
+@pytest.mark.promise("Verdict", "A model whose free run runs away is refused in one line")
+def test_a_model_that_runs_away_is_refused():
+    absurd = replace(BENCH, model={**BENCH.model, "L_over_J": 3.0 * BENCH.model["L_over_J"], "c_over_J": 0.0})
+    with pytest.raises(RecordingError, match="runs away"):
+        diagnose(absurd, [recorded(3, {}, 70.0)])
 
 
 @pytest.mark.promise("Verdict", "Small imperfections beside a known effect do not make it an unknown one")

@@ -5,6 +5,7 @@ import pytest
 from aeropend_ident.diagnosis.chain.free_run import free_run
 from aeropend_ident.diagnosis.free_run_gap import closure, floor, gap
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, recorded
+from aeropend_sim.readings import MOST
 
 
 def measured(model, seed=21, effects=None):
@@ -35,19 +36,22 @@ def test_share_of_what_can_close():
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_run_that_gives_no_number_has_no_gap_and_no_warning():
+def test_a_run_that_gives_no_number_diverges_without_warning():
     signals = recorded(21, duration=8.0)
     nothing = {c: np.full(len(signals), np.nan) for c in ("theta", "omega", "i_a", "v_a")}
-    assert np.isnan(gap(nothing, signals, signals.train, len(signals)).total)
+    found = gap(nothing, signals, signals.train, len(signals))
+    assert found.diverges
+    assert found.rms == {c: pytest.approx(2.0 * MOST[c]) for c in found.rms}
 
 
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("end", [np.nan, np.inf, 1e300])
-def test_a_run_that_diverges_at_its_end_has_no_gap(end):
+def test_a_run_that_diverges_at_its_end_has_a_large_gap(end):
     signals = recorded(21, duration=8.0)
     run = {c: np.nan_to_num(signals.channel(c)) for c in ("theta", "omega", "i_a", "v_a")}
     run["theta"][-3:] = end
     found = gap(run, signals, signals.train, len(signals))
-    assert np.isnan(found.rms["theta"])
-    assert np.isfinite(found.rms["i_a"])
+    assert found.diverges
+    assert 2.0 * MOST["theta"] > found.rms["theta"] > 0.03 * MOST["theta"]
+    assert found.rms["i_a"] < 1e-9
     assert np.isfinite(found.windows).all()

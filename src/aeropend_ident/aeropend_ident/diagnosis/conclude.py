@@ -36,7 +36,7 @@ from aeropend_ident.diagnosis.document import (
 )
 from aeropend_ident.diagnosis.document import UnknownEffect as DrawnEffect
 from aeropend_ident.diagnosis.experiment_design import EXPERIMENTS, experiments_within
-from aeropend_ident.diagnosis.free_run_gap import HeldOut, closure
+from aeropend_ident.diagnosis.free_run_gap import Gap, HeldOut, closure
 from aeropend_ident.diagnosis.joint_fit import WIDER, JointFit, run_to_run
 from aeropend_ident.diagnosis.measured import (
     Gaps,
@@ -68,6 +68,9 @@ from aeropend_sim.wording import times
 DETERMINED = 0.5
 """Share of a prior's width above which the recordings have not determined a parameter (choice)."""
 
+RUNS_AWAY = ("the free run of the model runs away where the rig does not; check the numbers of the model file "
+             "(doctor), or let them be identified (--fit-nominal)")
+
 FACTORS = {"": "", "thrust": " (share of the thrust)", "theta_dot": " (damping)", "i_a": " (resistance)"}
 """What the values of a curve are that is multiplied by a quantity."""
 
@@ -79,7 +82,8 @@ def conclusions(now: Measured, settings: Settings) -> Conclusions:
     calibrated = chains.policy.calibrated
     share = gap_share.shares(parts)
     head = gap_share.headline(parts, share, settings.material)
-    failed = found.failed or _why_untried(stages, head.verdict) or _why_not_predicted(chains, gaps)
+    failed = (found.failed or _why_untried(stages, head.verdict) or _why_not_predicted(chains, gaps)
+              or (RUNS_AWAY if gaps.after.diverges else ""))
     if head.verdict == "none" and not calibrated:
         failed = failed or gap_share.why_unsure(share, settings.material)
     if failed:
@@ -275,7 +279,7 @@ def candidates(joint: JointFit, statistical: Statistical, held_out: HeldOut, gap
                 if mine:
                     estimates = _over_forms(estimates, r, f.stage)
                     strength = strengths.interval(r, f.stage, joint.checks[f.stage].form)
-                after = gap_after if mine else _finite(held_out.gap_of(whole).total)
+                after = gap_after if mine else _bounded(held_out.gap_of(whole))
                 since, until = (onset.since, onset.until) if onset and mine else (None, None)
                 effect = family(h.effect)
                 rows[h.family] = Candidate(
@@ -408,6 +412,11 @@ def _finite(x: float) -> float | None:
     return x if math.isfinite(x) else None
 
 
+def _bounded(gap: Gap) -> float | None:
+    """The total gap; None if the run diverges."""
+    return None if gap.diverges else gap.total
+
+
 def _unlearned(values: Mapping[str, float], learned: Learned | None) -> dict[str, float]:
     """The values without those of a learned term: no experiment is designed for its many numbers."""
     return {n: v for n, v in values.items() if learned is None or key(n).owner != learned.id}
@@ -455,8 +464,7 @@ def _drawn(term: MissingTerm, learned: Learned | None, joint: JointFit, gaps: Ga
 def _gap_with(values: Mapping[str, float], learned: Learned, joint: JointFit, gaps: Gaps) -> float | None:
     """The gap with a formula in place of the learned term; None if the model diverges."""
     others = {n: v for n, v in joint.values.items() if key(n).owner != learned.id}
-    after = gaps.held_out.gap_of({**others, **values}).total
-    return after if math.isfinite(after) else None
+    return _bounded(gaps.held_out.gap_of({**others, **values}))
 
 
 def _left(findings: Mapping[str, Findings], *, gust: bool) -> dict[str, float]:

@@ -16,11 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.diagnosis import gap_share, regions, typed_json
 from aeropend_ident.diagnosis.chain import static_map
 from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.driven_rig import fit_driven_rig, fit_own, without_findings
+from aeropend_ident.diagnosis.chain.free_run import free_run
 from aeropend_ident.diagnosis.chain.hanging import mounted
 from aeropend_ident.diagnosis.chain.known import Known
 from aeropend_ident.diagnosis.chain.nominal_fit import fit_nominal_model
@@ -120,6 +122,9 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
         known: what earlier verdicts of the rig know of the model; the verdict is then what has changed.
         further: ids of effects of effect files that are tried beside those of the catalogue.
         left_out: ids of fitted effects that are not tried; not of those that only statistics show.
+
+    Raises:
+        RecordingError: the recordings cannot be used, or the model runs away under their duty.
     """
     deadline = None if seconds is None else time.monotonic() + seconds
     with threadpool_limits(1):  # the matrices are narrow: threads of the linear algebra would slow each other down
@@ -140,11 +145,24 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
             state = rig.state
         elif fit_nominal:
             model, recordings = fit_nominal_model(model, recordings, deadline)
+        if policy.calibrated:
+            _refuse_divergence(model, recordings)
         kind = CutChains if policy.calibrated else CachedChains
         chains = with_pwm_timing(kind(model, recordings, policy))
         chains.likely, chains.state, chains.plain, chains.notes, chains.known = likely, state, plain, notes, known
         chains.further, chains.left_out = tuple(further), tuple(left_out)
         return _diagnose(chains, Settings(jobs, material, deadline), progress)
+
+
+def _refuse_divergence(model: Model, recordings: Sequence[Signals]) -> None:
+    """Refuse a nominal model whose free run leaves all that can be read.
+
+    Raises:
+        RecordingError: it does.
+    """
+    if any(gap(free_run(model, s), s, 0, len(s)).diverges for s in recordings):
+        raise RecordingError(f"the model {model.name} runs away under the duty that was recorded, so that nothing can "
+                             "be compared: check its numbers (doctor), or let them be identified (--fit-nominal)")
 
 
 def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diagnosis:
@@ -205,8 +223,8 @@ def _without_harmful(fitted: CutChains, found: Found, joint: JointFit, gaps: Gap
                      progress: Progress) -> Measured:
     """Take out the effects that make the gap larger on data that no fit has used.
 
-    These have a negative part, or the others leave less without them. One at a time, the most harmful first: of effects
-    that stand in for each other, one may be needed.
+    These have a negative part, or the others leave less without them, or the run diverges with them. One at a time, the
+    most harmful first: of effects that stand in for each other, one may be needed.
     """
     needed: set[str] = set()
     parts = parts_of(found, joint, gaps, settings)
@@ -214,10 +232,11 @@ def _without_harmful(fitted: CutChains, found: Found, joint: JointFit, gaps: Gap
     def closes(p: Part) -> float:
         return min(p.amount, p.unique) if p.amount >= settings.material * gap_share.whole(parts) else p.amount
 
-    while harmful := [p for p in parts if closes(p) < 0.0 and p.name not in needed]:
+    while harmful := [p for p in parts if (closes(p) < 0.0 or gaps.after.diverges) and p.name not in needed]:
         name = min(harmful, key=closes).name
         without = fit_and_measure(fitted, _without(found, name), progress)
-        if not without[2].after.total <= gaps.after.total:
+        less = without[2].after.total
+        if not (less < gaps.after.total if gaps.after.diverges else less <= gaps.after.total):
             needed.add(name)  # nominal numbers could take its part over only against what is known of them
             continue
         found, joint, gaps = without

@@ -49,11 +49,13 @@ class Gap:
         rms: channel -> RMS of simulated minus measured, in SI units.
         spread: channel -> standard deviation of the measured channel; of the whole recording where the channel rests.
         windows: (W, C) mean square over each bootstrap window, over spread squared.
+        diverges: whether a simulated channel leaves all that a reading can be; its error is limited to twice that.
     """
 
     rms: dict[str, float]
     spread: dict[str, float]
     windows: Array
+    diverges: bool = False
 
     @property
     def total(self) -> float:
@@ -71,7 +73,7 @@ class Gap:
 
 def gap(readings: Mapping[str, Array], signals: Signals, start: int, stop: int,
         left_out: NDArray[np.bool_] | None = None) -> Gap:
-    """The gap between readings of a model and a recording; NaN in a channel of a run that diverges.
+    """The gap between readings of a model and a recording.
 
     Args:
         readings: channel -> (N,).
@@ -80,7 +82,7 @@ def gap(readings: Mapping[str, Array], signals: Signals, start: int, stop: int,
         stop: first sample after the last.
         left_out: (N,) samples at which the speed read is known to be false.
     """
-    rms, spread, squares = {}, {}, []
+    rms, spread, squares, diverges = {}, {}, [], False
     for channel in CHANNELS:
         measured = signals.channel(channel)[start:stop]
         known = np.isfinite(measured)
@@ -89,8 +91,10 @@ def gap(readings: Mapping[str, Array], signals: Signals, start: int, stop: int,
         if known.sum() < FEWEST:
             continue
         error = np.where(known, readings[channel][start:stop] - measured, np.nan)
-        if not (np.abs(error[known]) <= 2.0 * MOST[channel]).all():  # the run diverges
-            error[:] = np.nan
+        most = 2.0 * MOST[channel]
+        if not (np.abs(error[known]) <= most).all():
+            diverges = True
+            error[known] = np.clip(np.nan_to_num(error[known], nan=most), -most, most)
         rms[channel] = float(np.sqrt(np.mean(error[known] ** 2)))
         everywhere = float(np.nanstd(signals.channel(channel)))
         here = float(np.std(measured[known]))
@@ -101,7 +105,7 @@ def gap(readings: Mapping[str, Array], signals: Signals, start: int, stop: int,
     with np.errstate(all="ignore"):
         windows = np.array([[np.nanmean(s[a:a + width]) if np.isfinite(s[a:a + width]).any() else 0.0
                              for s in squares] for a in edges]).reshape(len(edges), len(squares))
-    return Gap(rms, spread, windows)
+    return Gap(rms, spread, windows, diverges)
 
 
 def floor(signals: Signals, start: int, stop: int) -> dict[str, float]:
@@ -204,7 +208,7 @@ class HeldOut:
         spread = {c: math.sqrt(float(np.mean([g.spread[c] ** 2 for g in gaps]))) for c in channels}
         columns = [[list(g.rms).index(c) for c in channels] for g in gaps]
         windows = np.concatenate([g.windows[:, i] for g, i in zip(gaps, columns, strict=True)])
-        return Gap(rms, spread, windows)
+        return Gap(rms, spread, windows, any(g.diverges for g in gaps))
 
     def gap_of(self, values: Mapping[str, float]) -> Gap:
         """The gap of the model with these values."""

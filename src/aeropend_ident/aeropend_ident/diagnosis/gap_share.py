@@ -355,8 +355,8 @@ def _ids(parts: Iterable[Part]) -> list[str]:
 
 def squared(gap: Gap) -> float:
     """The squared gap; a run that diverges counts as a constant, whose gap is 1."""
-    return gap.total**2 if math.isfinite(gap.total) else 1.0
+    return 1.0 if gap.diverges else gap.total**2
 
 
 def _windows(gap: Gap) -> Array:
-    return np.asarray(gap.windows.mean(axis=1)) if math.isfinite(gap.total) else np.ones(len(gap.windows))
+    return np.ones(len(gap.windows)) if gap.diverges else np.asarray(gap.windows.mean(axis=1))

@@ -159,7 +159,7 @@ class Measured(NamedTuple):
     def closes_more(self, other: Measured, material: float) -> bool:
         """Whether this leaves less than other findings, by a material share of what is open."""
         less = gap_share.squared(other.gaps.after) - gap_share.squared(self.gaps.after)
-        return less > material * other.open_
+        return less > material * other.open_ and not self.gaps.after.diverges
 
     def shows_approximation(self, known: Measured, material: float) -> bool:
         """Whether this, with one unknown term, leaves so little that known effects only approximate that term."""

@@ -376,12 +376,12 @@ def difference(measured: Array, simulated: Array) -> Array:
 
     Args:
         measured: (N,) NaN where missing.
-        simulated: (N,) What is not finite counts as `RAN_AWAY`.
+        simulated: (N,) What is farther off than `RAN_AWAY`, or not finite, counts as `RAN_AWAY`.
 
     Returns:
         (M,) differences at the M <= N known samples.
     """
     off = (measured - simulated)[np.isfinite(measured)]
-    if np.isfinite(off).all():
+    if off @ off < RAN_AWAY**2:
         return off
-    return np.nan_to_num(off, nan=RAN_AWAY, posinf=RAN_AWAY, neginf=-RAN_AWAY)
+    return np.clip(np.nan_to_num(off, nan=RAN_AWAY), -RAN_AWAY, RAN_AWAY)

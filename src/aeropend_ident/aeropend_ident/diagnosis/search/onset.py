@@ -257,7 +257,10 @@ def _best_windows(chains: CutChains, stage: str, f: Findings, candidates: Sequen
         return []
     cuts = np.searchsorted(at[order], instants)
     information = jacobian @ jacobian.T + search.prior
-    inverse = np.linalg.inv(information)
+    try:
+        inverse = np.linalg.inv(information)
+    except np.linalg.LinAlgError:  # a run that runs away: nothing stands out of it
+        return []
     pull = inverse @ (jacobian @ r + search.z)
 
     def gains(column: Array) -> tuple[Array, Array]:
