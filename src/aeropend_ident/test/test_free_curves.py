@@ -125,18 +125,18 @@ def test_hats_draw_any_line_between_their_knots():
     x[::50] = np.nan
     knots = knots_of(x)
     basis = hats(x, knots)
-    assert basis.shape == (2000, KNOTS)
-    np.testing.assert_allclose(basis.sum(axis=1), 1.0)
+    assert basis.shape == (KNOTS, 2000)
+    np.testing.assert_allclose(basis.sum(axis=0), 1.0)
     inside = (x > knots[0]) & (x < knots[-1])
     assert inside.mean() > 0.9
-    np.testing.assert_allclose((basis @ (2.0 * knots + 1.0))[inside], 2.0 * x[inside] + 1.0)
+    np.testing.assert_allclose(((2.0 * knots + 1.0) @ basis)[inside], 2.0 * x[inside] + 1.0)
 
 
 @pytest.mark.parametrize("x", [np.zeros(50), np.full(50, np.nan)])
 def test_what_does_not_vary_carries_no_curve(x):
     knots = knots_of(x)
     basis = hats(x, knots)
-    assert basis.shape == (50, 0)
+    assert basis.shape == (0, 50)
     assert len(knots) == 0
 
 

@@ -43,8 +43,8 @@ from aeropend_ident.diagnosis.measured import (
     Measured,
     Settings,
     Statistical,
-    parts_of_effects,
     parts_of_parameters,
+    share_of_learned,
 )
 from aeropend_ident.diagnosis.policy import CALIBRATED, GOOD_ENOUGH, MATERIAL_SHARE, angle_only
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis
@@ -94,7 +94,7 @@ def conclusions(now: Measured, settings: Settings) -> Conclusions:
     left = _left({**stages, **unlearned}, gust=found.statistical.gust is not None)
     reasons = [f"{c} is off by {times(x)} a reading's noise" for c, x in left.items() if x > GOOD_ENOUGH]
     reasons = [failed] if failed else reasons
-    drawn = None if unknown is None else _drawn(unknown.term, found.learned, joint, gaps, settings)
+    drawn = None if unknown is None else _drawn(unknown.term, now, settings)
     undecided = not_separable(chains, stages)
     tried = EXPERIMENTS if calibrated else experiments_within(max(s.largest_duty for s in found.recordings))
     rows = parameter_rows(chains, joint)
@@ -446,19 +446,18 @@ def _why_not_predicted(chains: CutChains, gaps: Gaps) -> str:
             "a longer recording whose last third repeats angles and duties of the part before helps most")
 
 
-def _drawn(term: MissingTerm, learned: Learned | None, joint: JointFit, gaps: Gaps, settings: Settings
-           ) -> DrawnEffect:
+def _drawn(term: MissingTerm, now: Measured, settings: Settings) -> DrawnEffect:
     """The unknown effect by the curves of the term that was learned; by free curves if none was."""
+    joint, gaps, learned = now.joint, now.gaps, now.found.learned
     if learned is None:
         return DrawnEffect(term.place, tuple(
             Curve(c.variable, c.unit, tuple(c.knot.tolist()), tuple(c.value.tolist())) for c in term.curves))
-    share = gap_share.shares(parts_of_effects(joint, gaps, settings))
     curves = tuple(Curve(f"{c.form.of}{FACTORS[c.form.factor]}", c.form.value_unit, tuple(c.knot.tolist()),
                          tuple(learned.values_of(c, joint.values))) for c in learned.curves)
     fitted = fitted_formulas(gaps.held_out.chains, learned, joint.values, joint.sd, settings.jobs)
     formulas = tuple(Formula(f.id, DEFINED[f.id].term, {n: p.default for n, p in DEFINED[f.id].parameters.items()},
                              _gap_with(f.values, learned, joint, gaps)) for f in fitted)
-    return DrawnEffect(learned.place, curves, learned.id, share.get(learned.id), formulas)
+    return DrawnEffect(learned.place, curves, learned.id, share_of_learned(now, learned, settings), formulas)
 
 
 def _gap_with(values: Mapping[str, float], learned: Learned, joint: JointFit, gaps: Gaps) -> float | None:

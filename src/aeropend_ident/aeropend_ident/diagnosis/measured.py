@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from aeropend_ident.diagnosis import gap_share, regions
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.values import PLACE_OF_PARAMETER, neutral
-from aeropend_ident.diagnosis.document import GapBudget
+from aeropend_ident.diagnosis.document import GapBudget, Interval
 from aeropend_ident.diagnosis.free_run_gap import Gap, HeldOut
 from aeropend_ident.diagnosis.gap_budget import Repeats, budget
 from aeropend_ident.diagnosis.gap_share import Part
@@ -200,14 +200,7 @@ def _measure(fitted: CutChains, found: Found, joint: JointFit) -> Gaps:
 
 def parts_of(found: Found, joint: JointFit, gaps: Gaps, settings: Settings) -> list[Part]:
     """The parts of the gap: of each effect, and of what stays unexplained."""
-    held_out, statistical = gaps.held_out.in_motion(), found.statistical
-    parts = parts_of_effects(joint, gaps, settings)
-    unknown = None
-    if found.unknown is not None:
-        # of a calibrated rig the noise is known: what exceeds it is missing in the model, though it may not repeat
-        share = 1.0 if found.chains.policy.calibrated else gaps.repeats.of_stage(found.unknown.stage).share
-        unknown = Repeatable(found.unknown.term.place, share)
-    parts += gap_share.unexplained(held_out.gap(gaps.runs_after), gaps.floors, statistical.gust, unknown)
+    statistical, parts = found.statistical, _parts_with_learned(found, joint, gaps, settings)
     if (learned := found.learned) is not None:  # what it closes, and what it leaves, is of the unknown effect
         its = [p for p in parts if p.name in (learned.id, gap_share.UNKNOWN)]
         one = Part(gap_share.UNKNOWN, learned.place, sum(max(p.amount, 0.0) for p in its),
@@ -218,6 +211,23 @@ def parts_of(found: Found, joint: JointFit, gaps: Gaps, settings: Settings) -> l
         parts.append(gap_share.part_of_spikes(statistical.spikes, whole.gap(gaps.runs_before, known=False),
                                               whole.gap(gaps.runs_before)))
     return parts
+
+
+def share_of_learned(now: Measured, learned: Learned, settings: Settings) -> Interval | None:
+    """The share of the gap that a learned term closes."""
+    return gap_share.shares(_parts_with_learned(now.found, now.joint, now.gaps, settings)).get(learned.id)
+
+
+def _parts_with_learned(found: Found, joint: JointFit, gaps: Gaps, settings: Settings) -> list[Part]:
+    """The same with a learned term like another effect, and without false captures."""
+    parts = parts_of_effects(joint, gaps, settings)
+    unknown = None
+    if found.unknown is not None:
+        # of a calibrated rig the noise is known: what exceeds it is missing in the model, though it may not repeat
+        share = 1.0 if found.chains.policy.calibrated else gaps.repeats.of_stage(found.unknown.stage).share
+        unknown = Repeatable(found.unknown.term.place, share)
+    after = gaps.held_out.in_motion().gap(gaps.runs_after)
+    return parts + gap_share.unexplained(after, gaps.floors, found.statistical.gust, unknown)
 
 
 def parts_of_effects(joint: JointFit, gaps: Gaps, settings: Settings) -> list[Part]:

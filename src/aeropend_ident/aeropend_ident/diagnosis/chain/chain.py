@@ -382,6 +382,8 @@ def difference(measured: Array, simulated: Array) -> Array:
         (M,) differences at the M <= N known samples.
     """
     off = (measured - simulated)[np.isfinite(measured)]
-    if off @ off < RAN_AWAY**2:
+    with np.errstate(over="ignore"):
+        near = off @ off < RAN_AWAY**2
+    if near:
         return off
     return np.clip(np.nan_to_num(off, nan=RAN_AWAY), -RAN_AWAY, RAN_AWAY)

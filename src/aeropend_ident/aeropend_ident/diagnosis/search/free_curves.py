@@ -170,11 +170,15 @@ def knots_of(x: Array, count: int = KNOTS) -> Array:
 
 
 def hats(x: Array, knots: Array) -> Array:
-    """Piecewise linear basis (N, K) of a variable x (N,) at knots (K,)."""
-    if not len(knots):
-        return np.zeros((len(x), 0))
-    filled = np.nan_to_num(x, nan=float(knots[0]))
-    return np.column_stack([np.interp(filled, knots, row) for row in np.eye(len(knots))])
+    """Piecewise linear basis (K, N) of a variable x (N,) at knots (K,); constant beyond the ends."""
+    out = np.zeros((len(knots), len(x)))
+    if len(knots):
+        filled = np.nan_to_num(x, nan=float(knots[0]))
+        left = np.clip(np.searchsorted(knots, filled, side="right") - 1, 0, len(knots) - 2)
+        right = np.clip((filled - knots[left]) / np.diff(knots)[left], 0.0, 1.0)
+        each = np.arange(len(x))
+        out[left, each], out[left + 1, each] = 1.0 - right, right
+    return out
 
 
 @njit(nogil=True)
@@ -193,15 +197,15 @@ def arm_response(drive: Array, stiffness: Array, damping: float, tau: float, h: 
     """
     out = np.empty_like(drive)
     keep = math.exp(-h / tau) if tau > 0.0 else 0.0
-    for j in range(drive.shape[0]):
-        x = v = s1 = s2 = 0.0
-        for k in range(drive.shape[1]):
-            out[j, k] = s2
-            a, b, c, d, e, f = linear_arm(stiffness[k], damping, h)
+    x, v, s1, s2 = np.zeros((4, drive.shape[0]))
+    for k in range(drive.shape[1]):
+        a, b, c, d, e, f = linear_arm(stiffness[k], damping, h)
+        for j in range(drive.shape[0]):
+            out[j, k] = s2[j]
             u = drive[j, k]
-            x, v = a * x + b * v + c * u, d * x + e * v + f * u
-            s1 = keep * s1 + (1.0 - keep) * x
-            s2 = keep * s2 + (1.0 - keep) * s1
+            x[j], v[j] = a * x[j] + b * v[j] + c * u, d * x[j] + e * v[j] + f * u
+            s1[j] = keep * s1[j] + (1.0 - keep) * x[j]
+            s2[j] = keep * s2[j] + (1.0 - keep) * s1[j]
     return out
 
 
@@ -228,17 +232,18 @@ def motor_response(voltage: Array, torque: Array, omega: Array, R_a: float, L_a:
     """
     i_out, w_out, angle_out = np.empty_like(voltage), np.empty_like(voltage), np.empty_like(voltage)
     decay = math.exp(-h * R_a / L_a)
-    for j in range(voltage.shape[0]):
-        i = w = angle = 0.0
-        for k in range(voltage.shape[1]):
-            i_out[j, k], w_out[j, k], angle_out[j, k] = i, w, angle
-            load = (B_m + 2.0 * k_load * abs(omega[k])) / J_m
-            goal = (voltage[j, k] - K_e * w) / R_a
-            mean = goal + (i - goal) * (1.0 - decay) * L_a / (R_a * h)
-            i = goal + (i - goal) * decay
-            w1 = (w + h * (K_t * mean + torque[j, k]) / J_m) / (1.0 + h * load)
-            angle += 0.5 * h * (w + w1)
-            w = w1
+    over_hold, per_resistance, per_inertia = (1.0 - decay) * L_a / (R_a * h), 1.0 / R_a, h / J_m
+    i, w, angle = np.zeros((3, voltage.shape[0]))
+    for k in range(voltage.shape[1]):
+        slowed = 1.0 / (1.0 + per_inertia * (B_m + 2.0 * k_load * abs(omega[k])))
+        for j in range(voltage.shape[0]):
+            i_out[j, k], w_out[j, k], angle_out[j, k] = i[j], w[j], angle[j]
+            goal = (voltage[j, k] - K_e * w[j]) * per_resistance
+            mean = goal + (i[j] - goal) * over_hold
+            i[j] = goal + (i[j] - goal) * decay
+            after = (w[j] + per_inertia * (K_t * mean + torque[j, k])) * slowed
+            angle[j] += 0.5 * h * (w[j] + after)
+            w[j] = after
     return i_out, w_out, angle_out
 
 
@@ -272,8 +277,8 @@ class _Stage:
 
     def curves(self, names: Sequence[str], unit: str, factor: Array | float = 1.0, said: str = "") -> Columns:
         """Curves of some variables, times a factor; `said` is added to their names."""
-        return [(name + said, unit, self.knots[name], np.ascontiguousarray(
-            hats(self.variables[name], self.knots[name]).T * factor * self.acts)) for name in names]
+        return [(name + said, unit, self.knots[name],
+                 hats(self.variables[name], self.knots[name]) * (factor * self.acts)) for name in names]
 
     @cached_property
     def acts(self) -> Array:
@@ -404,7 +409,8 @@ def _rows(chain: CutChain, channel: str, response: Mapping[str, Array], count: i
     known = np.isfinite(measured[start:s.train])
     if channel not in response:
         return np.zeros((count, int(known.sum())))
-    return finite(response[channel], LARGEST)[:, start:s.train][:, known] / s.sigma[channel]
+    rows = response[channel][:, start:s.train]
+    return finite(rows if known.all() else rows[:, known], LARGEST) / s.sigma[channel]
 
 
 @dataclass(frozen=True)

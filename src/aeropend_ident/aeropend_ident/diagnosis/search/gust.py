@@ -108,7 +108,7 @@ def _judged(chains: CutChains, final: Fit) -> RankedHypothesis | None:
     theta, speed = filled_angle(chains, s)[g.index], chain.speed[g.index]
     rate = np.gradient(smoothed_angle(theta), g.index * s.period)
     slope = np.gradient(speed, g.index * s.period)
-    columns = np.hstack([*(hats(x, knots_of(x)) for x in (theta, rate, speed, slope)), (speed * rate)[:, None]])
+    columns = np.vstack([*(hats(x, knots_of(x)) for x in (theta, rate, speed, slope)), speed * rate]).T
     known = [p for p in nominal_parameters(chains, "arm") if p.name in final.values]
     if g.gain <= 0.0 or not g.resolved or g.kurtosis > JUMPS or follows_state(g.torque, columns) >= RANDOM:
         return None
