@@ -389,7 +389,7 @@ def test_an_arm_that_takes_longer_steps_swings_the_same(effects):
     speed, state = simulate(model, duty).omega, State(theta=0.2, theta_dot=-0.5)
     theta, rate, after = dynamics.swing(model, speed, state)
     each, prepared = np.empty((2, len(duty))), prepare(model)
-    exact = dynamics.run_arm(speed, state, 1, *prepared, (prepared[0], prepared[2]) if effects else None, each)
+    exact = dynamics.run_arm(speed, state, 1, *prepared, (prepared[0], prepared[2]), each)
     assert np.abs(theta - each[0]).max() < 1e-5 * np.ptp(theta)
     assert np.abs(rate - each[1]).max() < 1e-4 * np.ptp(rate)
     assert after.theta == pytest.approx(exact.theta, abs=1e-5)

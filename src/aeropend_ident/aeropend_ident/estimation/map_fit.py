@@ -509,7 +509,10 @@ def passed(deadline: float | None) -> bool:
 
 def finite(r: Array, largest: float = LARGEST) -> Array:
     """Residuals of any shape, or their slopes, of which each is at most so large, also where a simulation diverges."""
-    return r if np.abs(r).max(initial=0.0) <= largest else np.clip(np.nan_to_num(r, nan=largest), -largest, largest)
+    with np.errstate(over="ignore"):
+        if np.vdot(r, r) <= largest**2:  # in one pass
+            return r
+    return r if np.abs(r).max() <= largest else np.clip(np.nan_to_num(r, nan=largest), -largest, largest)
 
 
 def sensitivities(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter]

@@ -10,7 +10,6 @@ For the nominal model the effects are None: numba then compiles the equations wi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -191,48 +190,37 @@ def swing(model: Model, speed: Array, state: State, period: float = SAMPLE_PERIO
     """
     parts = model_parts(model)
     rate = max(rates(*parts, period)[1], 1.0 / LONGEST_ARM_STEP)
-    out = np.empty((2, len(speed)))
-    every, done = max(math.floor(1.0 / (period * rate) + 1e-9), 1), 0
-    if every > 1:
-        done = (len(speed) - 1) // every * every
-        state = _swing(parts, speed[:done + 1], state, every, rate, period, out[:, :done])
-    state = _swing(parts, speed[done:], state, 1, rate, period, out[:, done:])
-    return out[0], out[1], state
-
-
-def _swing(parts: tuple[Mapping[str, float], Values | None, Terms | None], speed: Array, state: State, every: int,
-           rate: float, period: float, out: Array) -> State:
-    """`run_arm` with steps that are short enough for a rate [1/s]."""
+    every = max(math.floor(1.0 / (period * rate) + 1e-9), 1)
     c, e, x, added = prepared(*parts, every * period, steps_of(every * period, rate))
-    short = None
-    if x is not None:
-        fine = prepared(*parts, period, steps_of(period, max(rate, 1.0 / LONGEST_STEP)))
-        short = fine[0], fine[2]
-    return run_arm(speed, state, every, c, e, x, added, short, out)
+    short = prepared(*parts, period, steps_of(period, max(rate, 1.0 / LONGEST_STEP)))
+    out = np.empty((2, len(speed)))
+    state = run_arm(speed, state, every, c, e, x, added, (short[0], short[2]), out)
+    return out[0], out[1], state
 
 
 @njit(nogil=True)
 def run_arm(speed: Array, state: State, every: int, c: Coefficients, e: Values | None, x: Extra | None,
-            added: Terms | None, short: tuple[Coefficients, Extra | None] | None, out: Array) -> State:
-    """Air and arm alone, for a given speed of the rotor, linear between samples.
+            added: Terms | None, short: tuple[Coefficients, Extra | None], out: Array) -> State:
+    """Air and arm alone, for a given speed of the rotor, linear between samples and held after the last one.
 
     Args:
         speed: (N,) [rad/s] speed at the samples.
         state: at the first sample.
-        every: samples in a hold of `c`. If 1, the speed is held after the last sample.
+        every: samples in a hold of `c`.
         c: coefficients.
         e: effects; None for the nominal plant.
         x: coefficients of the effects; None for the nominal plant.
         added: terms by formula; None without any.
-        short: coefficients of a hold of one sample in shorter steps, which are taken where the arm reverses against dry
-            friction or rests; None for the nominal plant.
-        out: (2, M), filled with θ, θ̇: at N samples, or, if `every` is greater than 1, at N - 1, a multiple of it.
+        short: coefficients of a hold of one sample, in shorter steps. They are taken where the arm reverses against dry
+            friction or rests, and for the samples after the last whole hold.
+        out: (2, N), filled with θ, θ̇ at the samples.
 
     Returns:
-        The state after the last sample of `out`.
+        The state after the last sample.
     """
     last = speed.shape[0] - 1
-    for k in range(0, out.shape[1], every):
+    whole = last // every * every if every > 1 else last + 1
+    for k in range(0, whole, every):
         before, w = state, speed[k]
         rise = (speed[min(k + every, last)] - w) / c.steps
         middle = 0.5 * rise
@@ -244,20 +232,27 @@ def run_arm(speed: Array, state: State, every: int, c: Coefficients, e: Values |
         for _ in range(c.steps):
             state = arm_after(state, w, w + middle, w + rise, c, e, x, added)
             w += rise
-        out[0, k], out[1, k] = before.theta, before.theta_dot
-        if short is not None and short[0].h < c.h and before.theta_dot * state.theta_dot <= 0.0 and has_dry_friction(
-                e, added):
-            state = before
-            for j in range(every):
-                out[0, k + j], out[1, k + j] = state.theta, state.theta_dot
-                w = speed[k + j]
-                rise = (speed[min(k + j + 1, last)] - w) / short[0].steps
-                for _ in range(short[0].steps):
-                    state = arm_after(state, w, w + 0.5 * rise, w + rise, short[0], e, short[1], added)
-                    w += rise
+        if short[0].h < c.h and before.theta_dot * state.theta_dot <= 0.0 and has_dry_friction(e, added):
+            state = each_sample(speed, before, k, k + every, e, added, short, out)
         else:
+            out[0, k], out[1, k] = before.theta, before.theta_dot
             for j in range(1, every):
                 out[0, k + j], out[1, k + j] = between(before, state, j / every, c.h)
+    return each_sample(speed, state, whole, last + 1, e, added, short, out)
+
+
+@equation
+def each_sample(speed: Array, state: State, first: int, stop: int, e: Values | None, added: Terms | None,
+                short: tuple[Coefficients, Extra | None], out: Array) -> State:
+    """`run_arm` over the samples from the first up to a stop, by the shorter steps."""
+    c, x = short
+    for k in range(first, stop):
+        out[0, k], out[1, k] = state.theta, state.theta_dot
+        w = speed[k]
+        rise = (speed[min(k + 1, speed.shape[0] - 1)] - w) / c.steps
+        for _ in range(c.steps):
+            state = arm_after(state, w, w + 0.5 * rise, w + rise, c, e, x, added)
+            w += rise
     return state
 
 

@@ -219,16 +219,20 @@ class CutChain:
 
     def arm(self, values: Values, stop: int | None = None) -> Array:
         """[rad] Angle (N,) as it would be read, before noise and quantisation; arguments as for `motor`."""
-        theta, rate = self.arm_motion(values, stop)
+        pieces = self.pieces(values, stop)
+        theta, rate = self._motion(values, pieces, stop)
         s, out = self.signals, np.empty(len(theta))
-        for piece, m in self.pieces(values, stop):
+        for piece, m in pieces:
             out[piece] = sensing.read_angle(m, theta, rate, s.period)[piece]
         return out
 
     def arm_motion(self, values: Values, stop: int | None = None) -> tuple[Array, Array]:
         """True angle [rad] and angular rate [rad/s], (N,) each; arguments as for `motor`."""
+        return self._motion(values, self.pieces(values, stop), stop)
+
+    def _motion(self, values: Values, pieces: Sequence[tuple[slice, Model]], stop: int | None) -> tuple[Array, Array]:
         s = self.signals
-        n = self.pieces(values)[0][1].numbers()
+        n = pieces[0][1].numbers()
         cut = s.has("omega") or s.has("i_a")
         if not cut and not s.duty.any() and "initial.omega" not in values and actuator.voltage(n, 0.0) == 0.0:
             speed = np.zeros(len(s))[:stop]  # the rotor stands
@@ -238,7 +242,7 @@ class CutChain:
                       theta_dot=values.get("initial.theta_dot", 0.0),
                       thrust=float(actuator.thrust(n, speed[0])))
         theta, rate = np.empty(len(speed)), np.empty(len(speed))
-        for piece, m in self.pieces(values, stop):
+        for piece, m in pieces:
             theta[piece], rate[piece], state = dynamics.swing(m, speed[piece], state, s.period)
         return theta, rate
 
@@ -381,7 +385,9 @@ def difference(measured: Array, simulated: Array) -> Array:
     Returns:
         (M,) differences at the M <= N known samples.
     """
-    off = (measured - simulated)[np.isfinite(measured)]
+    off, known = measured - simulated, np.isfinite(measured)
+    if not known.all():
+        off = off[known]
     with np.errstate(over="ignore"):
         near = off @ off < RAN_AWAY**2
     if near:
