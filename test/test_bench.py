@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from evaluation import bench, results
-from evaluation.benchmarks import growth, history, readme
+from evaluation.benchmarks import first_use, growth, history, readme
 from evaluation.benchmarks.measure import Figure, Spread, Target
 
 from aeropend_ident.diagnosis.search.hypotheses import hypotheses
@@ -169,3 +169,8 @@ def test_a_narrowed_model_leaves_these_effects_to_consider_and_is_otherwise_nomi
     assert {one.effect for one in hypotheses(model, mismatches=False)} == set(effects)
     assert model.model == load("bench").model
     assert model.sensing == load("bench").sensing
+
+
+def test_the_first_use_runs_every_kernel_and_tells_the_time(capsys):
+    first_use.main()
+    assert float(capsys.readouterr().out) > 0.0

@@ -193,26 +193,6 @@ def batch(quick: bool) -> list[Figure]:
                    Spread.of(c_s / ours_s), {"gcc_flags": ["-O3", *flags]}, load=about, main=True)]
 
 
-COMPILE = """
-import time, numpy as np
-start = time.process_time()
-from aeropend_sim.model import dynamics, ensemble, rig
-from aeropend_sim.model.effects import CATALOGUE
-from aeropend_sim.model.parameters import load
-imported = time.process_time()
-duty = np.full(10, 0.3)
-model = load("bench")
-full = model.with_effects({i: {n: p.default for n, p in e.parameters.items()} for i, e in CATALOGUE.items()})
-for one in (model, full):
-    rig.record(one, duty)
-    prepared = prepare(one)
-    dynamics.swing(one, duty, State())
-    dynamics.run_motor(duty, State(), *prepared, np.empty((3, 10)))
-ensemble.squared_errors([model], duty, np.zeros((4, 10)))
-print(imported - start, time.process_time() - imported)
-"""
-
-
 def compiling(quick: bool) -> list[Figure]:
     """CPU time that numba takes to compile every kernel of the simulation, once, and to load them later."""
     about = measure.load()
@@ -220,9 +200,8 @@ def compiling(quick: bool) -> list[Figure]:
         environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
 
         def seconds() -> float:
-            done = subprocess.run([sys.executable, "-c", COMPILE], env=environment, capture_output=True, text=True,
-                                  check=True)
-            return sum(float(word) for word in done.stdout.split())
+            program = [sys.executable, "-m", "evaluation.benchmarks.first_use"]
+            return float(subprocess.run(program, env=environment, capture_output=True, text=True, check=True).stdout)
 
         first, again = seconds(), seconds()
     del quick
