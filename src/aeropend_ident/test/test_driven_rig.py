@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from aeropend_ident.diagnosis.chain.driven_rig import Units, fit_driven_rig, fit_own, units_of
+from aeropend_ident.diagnosis.chain.driven_rig import Candidate, Units, fit_driven_rig, fit_own, units_of
 from aeropend_ident.diagnosis.chain.hanging import mounted
 from aeropend_ident.diagnosis.chain.weak_start import FULL, curve
 from aeropend_ident.diagnosis.diagnosis import diagnose
@@ -206,3 +206,14 @@ def test_a_command_that_explains_nothing_does_not_turn_the_sign():
 def test_a_static_curve_is_that_of_its_duties_also_of_a_model_without_a_map(own):
     numbers = curve({**BENCH.model, **own}, 0.2, 0.1, 0.5, 0.1)
     assert actuator.voltage(numbers, np.array([0.2, 1.0])) == pytest.approx([0.0, FULL], abs=1e-12)
+
+
+@pytest.mark.parametrize(("without", "needed"), [
+    ([2.0, 2.2, 2.0, 2.1, 2.0, 1.9], True),
+    ([1.04, 1.03, 1.04, 1.04, 1.03, 1.04], False),  # less than 5 %
+    ([9.0, 1.0, 1.0, 0.9, 1.0, 1.0], False),  # one block alone
+])
+def test_a_term_is_needed_if_its_absence_raises_the_error_by_more_than_its_standard_error(without, needed):
+    with_ = Candidate(None, None, np.ones(6))
+    assert with_.surely_better(Candidate(None, None, np.array(without))) is needed
+    assert not Candidate(None, None, np.array(without)).surely_better(with_)

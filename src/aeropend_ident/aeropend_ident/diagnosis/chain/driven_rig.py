@@ -81,7 +81,9 @@ MOST_STEPS, HALVINGS = 5, 4
 """Steps of a fit without a block, and trials of a step, each half as long as the one before (choice)."""
 
 NEEDED = 1.05
-"""Squared error of prediction without a term, over that with it, above which the term stays (choice: 2.5 % in RMS)."""
+"""Squared error of prediction without a term, over that with it, above which the term may stay (choice: 2.5 % in RMS).
+
+It stays if the errors of the blocks also differ by more than their standard error."""
 
 CURVE = 11
 """Points of the static curve from duty to lift that is reported (choice).
@@ -135,11 +137,24 @@ class Fitted(NamedTuple):
 
 @dataclass(frozen=True)
 class Candidate:
-    """A fitted nominal model: with which terms, where it ended, and its error of prediction by cross-validation."""
+    """A fitted nominal model: with which terms, where it ended, and its errors of prediction by cross-validation."""
 
     model: Model
     fit: Fit
-    error: float
+    errors: Array
+
+    @property
+    def error(self) -> float:
+        """The geometric mean over the blocks of time, so that no block decides alone, such as one with a large step."""
+        return float(np.exp(np.mean(np.log(self.errors))))
+
+    def surely_better(self, other: Candidate) -> bool:
+        """Whether the error is smaller, by more than its standard error over the blocks.
+
+        Source: the one-standard-error rule of L. Breiman et al., Classification and regression trees, 1984, 3.4.
+        """
+        ratio = np.log(other.errors / self.errors)
+        return bool(np.mean(ratio) > max(math.log(NEEDED), np.std(ratio, ddof=1) / math.sqrt(len(ratio))))
 
 
 @dataclass(frozen=True)
@@ -330,7 +345,7 @@ class _TermSearch:
             if owner in self.keep or passed(self.deadline):
                 continue
             tried = self._candidate(_with_terms(best.model, terms))
-            if best.error > NEEDED * tried.error and not any(_absent(tried, term) for term in terms):
+            if tried.surely_better(best) and not any(_absent(tried, term) for term in terms):
                 begun = model.with_effects({**model.effects, owner: tried.model.effects[owner]})
                 full = self.with_every_term(begun)[0]
                 again = None if full is None else self.simplified(full)
@@ -344,7 +359,7 @@ class _TermSearch:
             gone = [name for name in terms if _absent(best, name)]
             fewer = parallel(self.jobs, partial(self._without, best), gone[:1] or terms)
             simpler = min(fewer, key=lambda c: c.error, default=None)
-            if simpler is None or (simpler.error > NEEDED * best.error and not gone):
+            if simpler is None or (best.surely_better(simpler) and not gone):
                 return best
             best = simpler
         return None
@@ -378,7 +393,7 @@ class _TermSearch:
         return self._judged(_fitted(model, self.recordings, ROUNDS, STEPS))
 
     def _judged(self, one: Fitted) -> Candidate:
-        return Candidate(*one, _error(one.model, self.recordings, one.fit))
+        return Candidate(*one, _errors(one.model, self.recordings, one.fit))
 
 
 def _absent(c: Candidate, name: str) -> bool:
@@ -402,11 +417,10 @@ def fit_own(model: Model, recordings: Sequence[Signals], rounds: int = LAST_ROUN
                deadline)
 
 
-def _error(model: Model, recordings: Sequence[Signals], f: Fit) -> float:
-    """Mean square of the free run in blocks of time that were left out of the fit: the geometric mean over the blocks.
+def _errors(model: Model, recordings: Sequence[Signals], f: Fit) -> Array:
+    """Mean squares of the free run in blocks of time that were left out of the fit.
 
-    So no block decides alone, such as the only one with a large step. Each fit starts from that of all blocks and keeps
-    its derivatives: it ends nearby, and one run a step is enough.
+    Each fit starts from that of all blocks and keeps its derivatives: it ends nearby, and one run a step is enough.
     """
     chains = CachedChains(model, recordings, UNCALIBRATED)
     parameters = [replace(p, start=f.values[p.name]) for p in nominal_parameters(chains, "arm")]
@@ -415,7 +429,7 @@ def _error(model: Model, recordings: Sequence[Signals], f: Fit) -> float:
     information, _, _ = search.normal_equations(slopes)
     errors = [_error_of_block(search, slopes, information, channel, block) for channel, s in slopes.items()
               for block in np.array_split(np.arange(s.rows.shape[1]), BLOCKS)]
-    return float(np.exp(np.mean(np.log(errors))))
+    return np.array(errors)
 
 
 def _error_of_block(search: Search, slopes: Mapping[str, Sensitivities], information: Array, channel: str,
