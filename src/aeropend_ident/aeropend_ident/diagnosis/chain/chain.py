@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from aeropend_ident.diagnosis.chain.known import Known
 from aeropend_ident.diagnosis.chain.values import STAGES, Values, with_values, without_effects
 from aeropend_ident.diagnosis.policy import CALIBRATED, Policy
+from aeropend_ident.estimation.map_fit import finite
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.interrupt import check
 from aeropend_ident.signals.pulses import mean_speed
@@ -388,8 +389,4 @@ def difference(measured: Array, simulated: Array) -> Array:
     off, known = measured - simulated, np.isfinite(measured)
     if not known.all():
         off = off[known]
-    with np.errstate(over="ignore"):
-        near = off @ off < RAN_AWAY**2
-    if near:
-        return off
-    return np.clip(np.nan_to_num(off, nan=RAN_AWAY), -RAN_AWAY, RAN_AWAY)
+    return finite(off, RAN_AWAY)

@@ -327,12 +327,10 @@ class _TermSearch:
             if fits and passed(self.deadline):
                 break
             part = [replace(s, train=min(max(round(share * s.train), least), s.train)) for s in self.recordings]
-            fits = sorted(parallel(self.jobs, partial(self._over, part), models), key=lambda one: one.fit.mean_square)
+            fitted = partial(_fitted, recordings=part, rounds=2, steps=STEPS, deadline=self.deadline)
+            fits = sorted(parallel(self.jobs, fitted, models), key=lambda one: one.fit.mean_square)
             models = [one.model for one in fits[:many]]
         return fits[0]
-
-    def _over(self, part: Sequence[Signals], model: Model) -> Fitted:
-        return _fitted(model, part, 2, STEPS, self.deadline)
 
     def refined(self, model: Model, best: Candidate) -> Candidate:
         """Add what refines a term, with that term, where a cross-validated free run needs it.
