@@ -486,7 +486,7 @@ class Identified:
         lift: only where duty and angle are all that was measured.
         hangs_at: only where it was fitted.
         mounting: of the angle's sensor, only where its zero or its sign was found from the motion.
-        own: effects that the nominal model holds since a cross-validated free run needs them: name -> size.
+        own: effects that the nominal model holds since the log evidence is larger with them: name -> size.
     """
 
     basis: str = field(metadata={"key": "from"})

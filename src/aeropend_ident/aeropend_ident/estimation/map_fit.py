@@ -80,6 +80,9 @@ RIDGE = 1e-12
 NEGLIGIBLE = 3e-3
 """Relative decrease of the sum of squares at which `within_bounds` ends (choice: a gap then changes by 0.2 %)."""
 
+POORER = 1.05
+"""Ratio of mean squares above which a fit has ended in a worse local minimum than another (choice: 2.5 % in RMS)."""
+
 ENOUGH, ENOUGH_OF_EXCESS = 1e-2, 1e-4
 """Decrease of the cost below which the search stops: absolute, and relative to the cost above that of noise.
 

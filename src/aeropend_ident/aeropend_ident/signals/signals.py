@@ -103,6 +103,7 @@ class Signals:
         train: number of samples that models are fitted to; the rest is held out.
         notes: remarks on the data for a person.
         mounting: of the angle's sensor, if it was found from the motion; `theta` is right then.
+        hanging: [rad] `theta` while the arm hangs, before it is driven; None if that was not read.
         window: first sample at which effects act that the model lacks, and the first at which they act no more; None:
             they act all the time.
         variant: of the rig in this recording.
@@ -121,6 +122,7 @@ class Signals:
     notes: tuple[str, ...] = ()
     window: tuple[int, int] | None = None
     mounting: Mounting | None = None
+    hanging: float | None = None
     variant: Variant = SAME
 
     def __len__(self) -> int:

@@ -2,9 +2,9 @@
 """The nominal model of a driven rig whose angle and command alone were recorded.
 
 It holds what a careful person tries first: a static curve from duty to lift with a dead zone, the lag of the rotor,
-viscous damping and the zero of the angle; and, where a cross-validated free run needs them, dry friction, a transport
-delay and a second lag. Duty and time are first brought to units in which every rig resembles the same one, so that
-neither the scale of the duty nor that of time matters.
+viscous damping and the zero of the angle; and, where the log evidence is larger with them, dry friction, a transport
+delay, a second lag, whose rise and fall may differ, and the exponent of the thrust. Duty and time are first brought to
+units in which every rig resembles the same one, so that neither the scale of the duty nor that of time matters.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from aeropend_ident.diagnosis.chain.values import FILTER, absent_at, of_rig, sta
 from aeropend_ident.diagnosis.chain.weak_start import WeakForm, downsampled, likeliest
 from aeropend_ident.diagnosis.document import Lift
 from aeropend_ident.diagnosis.policy import UNCALIBRATED
-from aeropend_ident.estimation.map_fit import ENOUGH, Fit, Search, Sensitivities, fit, passed
+from aeropend_ident.estimation.map_fit import POORER, Fit, fit, passed
 from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals
@@ -73,17 +73,6 @@ STEPS, ROUNDS = 8, 3
 
 LAST_STEPS, LAST_ROUNDS = 4, 10
 """The same of the last fit, which goes on to its end (choice)."""
-
-BLOCKS = 6
-"""Blocks of time of a cross-validation in each recording (choice: each holds some swings)."""
-
-MOST_STEPS, HALVINGS = 5, 4
-"""Steps of a fit without a block, and trials of a step, each half as long as the one before (choice)."""
-
-NEEDED = 1.05
-"""Squared error of prediction without a term, over that with it, above which the term may stay (choice: 2.5 % in RMS).
-
-It stays if the errors of the blocks also differ by more than their standard error."""
 
 CURVE = 11
 """Points of the static curve from duty to lift that is reported (choice).
@@ -136,28 +125,6 @@ class Fitted(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A fitted nominal model: with which terms, where it ended, and its errors of prediction by cross-validation."""
-
-    model: Model
-    fit: Fit
-    errors: Array
-
-    @property
-    def error(self) -> float:
-        """The geometric mean over the blocks of time, so that no block decides alone, such as one with a large step."""
-        return float(np.exp(np.mean(np.log(self.errors))))
-
-    def surely_better(self, other: Candidate) -> bool:
-        """Whether the error is smaller, by more than its standard error over the blocks.
-
-        Source: the one-standard-error rule of L. Breiman et al., Classification and regression trees, 1984, 3.4.
-        """
-        ratio = np.log(other.errors / self.errors)
-        return bool(np.mean(ratio) > max(math.log(NEEDED), np.std(ratio, ddof=1) / math.sqrt(len(ratio))))
-
-
-@dataclass(frozen=True)
 class DrivenRig:
     """The nominal model of a rig.
 
@@ -195,7 +162,7 @@ def fit_driven_rig(model: Model, recordings: Sequence[Signals], deadline: float 
     best = chosen or plain
     begun = units.model(best.model, back=True)
     found, f = _fitted(begun, recordings, LAST_ROUNDS, LAST_STEPS, deadline)
-    if f.mean_square > NEEDED * best.fit.mean_square and not passed(deadline):  # an arm that sticks at once stays so
+    if f.mean_square > POORER * best.fit.mean_square and not passed(deadline):  # an arm that sticks at once stays so
         state = units.state_back(best.fit.values)
         found, f = min((found, f), _fitted(begun, recordings, LAST_ROUNDS, LAST_STEPS, deadline, state),
                        key=lambda one: one[1].mean_square)
@@ -276,11 +243,6 @@ def _first_size(name: str, m: Model) -> float:
     return absent_at(name) + FIRST_SIZE * _usual(name, m)
 
 
-def _with_terms(m: Model, names: Sequence[str]) -> Model:
-    """A model with the terms that it lacks, at the sizes from which a fit starts."""
-    return with_values(m, {n: _first_size(n, m) for n in names if key(n).owner not in m.effects or refines(n)})
-
-
 @dataclass(frozen=True)
 class _TermSearch:
     """The search for the terms of the nominal model.
@@ -297,7 +259,7 @@ class _TermSearch:
     deadline: float | None
     jobs: int
 
-    def with_every_term(self, model: Model) -> tuple[Candidate | None, Fitted]:
+    def with_every_term(self, model: Model) -> tuple[Fitted | None, Fitted]:
         """The best fit with every term, None if there is no time for it; and the best one without any.
 
         Fits start from each lag, with and without dry friction, over growing horizons.
@@ -315,9 +277,14 @@ class _TermSearch:
         if passed(self.deadline):
             return None, plain
         begun = [plain, *begun[1 if starts[0] else 0:]]
-        full = [_with_terms(one.model, [n for n in CHOSEN if not refines(n)]) for one in begun]
+        full = [self._completed(one.model) for one in begun]
         most = min(parallel(self.jobs, self._fitted, full), key=lambda one: one.fit.mean_square)
-        return None if passed(self.deadline) else self._judged(most), plain
+        return None if passed(self.deadline) else most, plain
+
+    def _completed(self, m: Model) -> Model:
+        """A model with the terms that it lacks, at the sizes from which a fit starts."""
+        lacking = [n for n in CHOSEN if n not in held(m) and key(n).owner not in self.keep]
+        return with_values(m, {n: _first_size(n, m) for n in lacking})
 
     def _over_growing_horizons(self, models: Sequence[Model]) -> Fitted:
         """The best of some starts after fits over the beginning, then over more and more, while there is time."""
@@ -332,37 +299,29 @@ class _TermSearch:
             models = [one.model for one in fits[:many]]
         return fits[0]
 
-    def refined(self, model: Model, best: Candidate) -> Candidate:
-        """Add what refines a term, with that term, where a cross-validated free run needs it.
-
-        All else is then searched again: without it, the static curve had to stand in for it.
-        """
-        for name in filter(refines, CHOSEN):
-            owner = key(name).owner
-            terms = [f"{owner}.{DEFINED[owner].size}", name]
-            if owner in self.keep or passed(self.deadline):
-                continue
-            tried = self._candidate(_with_terms(best.model, terms))
-            if tried.surely_better(best) and not any(_absent(tried, term) for term in terms):
-                begun = model.with_effects({**model.effects, owner: tried.model.effects[owner]})
-                full = self.with_every_term(begun)[0]
-                again = None if full is None else self.simplified(full)
-                best = min((c for c in (tried, again) if c is not None), key=lambda c: c.error)
-        return best
-
-    def simplified(self, best: Candidate) -> Candidate | None:
-        """Take out the terms that a cross-validated free run does not need, the least needed first; None: no time."""
+    def simplified(self, best: Fitted) -> Fitted | None:
+        """Take out the terms without which the log evidence is larger, the least needed first; None: no time."""
         while not passed(self.deadline):
             terms = [name for name in held(best.model) if key(name).owner not in self.keep]
             gone = [name for name in terms if _absent(best, name)]
             fewer = parallel(self.jobs, partial(self._without, best), gone[:1] or terms)
-            simpler = min(fewer, key=lambda c: c.error, default=None)
-            if simpler is None or (best.surely_better(simpler) and not gone):
+            simpler = max(fewer, key=lambda one: one.fit.evidence_over(best.fit), default=None)
+            if simpler is None or (simpler.fit.evidence_over(best.fit) < 0.0 and not gone):
                 return best
             best = simpler
         return None
 
-    def delay_or_lag(self, best: Candidate) -> tuple[str, ...]:
+    def refined(self, model: Model, best: Fitted) -> Fitted:
+        """Search again with what refines a term, if it stayed: without it, the static curve had to stand in for it."""
+        owners = {key(name).owner for name in held(best.model) if refines(name)} - self.keep
+        if not owners:
+            return best
+        begun = model.with_effects({**model.effects, **{e: best.model.effects[e] for e in owners}})
+        full = self.with_every_term(begun)[0]
+        again = None if full is None else self.simplified(full)
+        return best if again is None or again.fit.evidence_over(best.fit) < 0.0 else again
+
+    def delay_or_lag(self, best: Fitted) -> tuple[str, ...]:
         """A note if the recordings do not tell whether a transport delay or a second lag puts the lift off."""
         here = [e for e in LAGS if e in best.model.effects]
         if len(here) != 1 or here[0] in self.keep:
@@ -377,27 +336,21 @@ class _TermSearch:
                 "that explains the angle about as well; steps of the command tell them apart best")
         return (said,)
 
-    def _without(self, c: Candidate, name: str) -> Candidate:
+    def _without(self, one: Fitted, name: str) -> Fitted:
         k = key(name)
-        effects = {e: p for e, p in c.model.effects.items() if e != k.owner or DEFINED[e].size != k.name}
+        effects = {e: p for e, p in one.model.effects.items() if e != k.owner or DEFINED[e].size != k.name}
         if k.owner in effects:
             effects[k.owner] = {**effects[k.owner], k.name: absent_at(name)}
-        return self._candidate(c.model.with_effects(effects))
+        return self._fitted(one.model.with_effects(effects))
 
     def _fitted(self, model: Model) -> Fitted:
         return _fitted(model, self.recordings, ROUNDS, STEPS, self.deadline)
 
-    def _candidate(self, model: Model) -> Candidate:
-        return self._judged(_fitted(model, self.recordings, ROUNDS, STEPS))
 
-    def _judged(self, one: Fitted) -> Candidate:
-        return Candidate(*one, _errors(one.model, self.recordings, one.fit))
-
-
-def _absent(c: Candidate, name: str) -> bool:
+def _absent(one: Fitted, name: str) -> bool:
     """Whether a term has ended at the size at which it is absent."""
-    size = c.model.effect(key(name).owner, key(name).name)
-    return abs(size - absent_at(name)) < NOTHING * abs(_usual(name, c.model))
+    size = one.model.effect(key(name).owner, key(name).name)
+    return abs(size - absent_at(name)) < NOTHING * abs(_usual(name, one.model))
 
 
 def _fitted(model: Model, recordings: Sequence[Signals], rounds: int, steps: int, deadline: float | None = None,
@@ -413,61 +366,6 @@ def fit_own(model: Model, recordings: Sequence[Signals], rounds: int = LAST_ROUN
     chains.state = state or {}
     return fit(chains.residuals("arm"), nominal_parameters(chains, "arm"), rounds, steps, UNCALIBRATED.least_ess,
                deadline)
-
-
-def _errors(model: Model, recordings: Sequence[Signals], f: Fit) -> Array:
-    """Mean squares of the free run in blocks of time that were left out of the fit.
-
-    Each fit starts from that of all blocks and keeps its derivatives: it ends nearby, and one run a step is enough.
-    """
-    chains = CachedChains(model, recordings, UNCALIBRATED)
-    parameters = [replace(p, start=f.values[p.name]) for p in nominal_parameters(chains, "arm")]
-    search = Search(chains.residuals("arm"), parameters, UNCALIBRATED.least_ess)
-    slopes = search.jacobian()
-    information, _, _ = search.normal_equations(slopes)
-    errors = [_error_of_block(search, slopes, information, channel, block) for channel, s in slopes.items()
-              for block in np.array_split(np.arange(s.rows.shape[1]), BLOCKS)]
-    return np.array(errors)
-
-
-def _error_of_block(search: Search, slopes: Mapping[str, Sensitivities], information: Array, channel: str,
-                    block: NDArray[np.intp]) -> float:
-    """Mean square in a block (M,) of a channel, at least that of noise, with parameters that are fitted to the rest."""
-    by, rows = slopes[channel].by, slopes[channel].rows[:, block]
-    without = information.copy()
-    without[np.ix_(by, by)] -= rows @ rows.T
-    z, now = search.z, search.current
-    cost = _cost_without(search, z, now, channel, block)
-    for _ in range(MOST_STEPS):
-        gradient = search.prior @ z
-        for k, s in slopes.items():
-            r = search.weight[k] * now[k]
-            if k == channel:
-                r[block] = 0.0
-            gradient[s.by] += s.rows @ r
-        free = search.free(z, gradient)
-        step = np.zeros(len(z))
-        step[free] = -np.linalg.solve(without[np.ix_(free, free)], gradient[free])
-        for _ in range(HALVINGS):
-            tried = np.clip(z + step, search.low, search.high)
-            there = search.at(tried)
-            new = _cost_without(search, tried, there, channel, block)
-            if new < cost:
-                break
-            step = 0.5 * step
-        else:
-            break
-        z, now, gained, cost = tried, there, cost - new, new
-        if gained < ENOUGH:
-            break
-    return max(float(np.mean(now[channel][block] ** 2)), 1.0)
-
-
-def _cost_without(search: Search, z: Array, residuals: Mapping[str, Array], channel: str, block: NDArray[np.intp]
-                  ) -> float:
-    own = search.weight[channel] * residuals[channel][block]
-    every = search.stack(residuals)
-    return float(every @ every - own @ own + z @ search.prior @ z)
 
 
 def lift(model: Model, recordings: Sequence[Signals]) -> Lift:

@@ -80,14 +80,21 @@ def mounted(model: Model, recordings: Sequence[Signals]) -> list[Signals]:
         found = Mounting(zero, found.flipped != turned)
         if found == before:
             break
-    return [found.of(s).noted(*found.notes()) for s in every]
+    every = [found.of(s).noted(*found.notes()) for s in every]
+    return [replace(s, hanging=_hanging(s)) for s in every]
+
+
+def _hanging(s: Signals) -> float | None:
+    """[rad] The reading of an arm that rests at first near the zero that was found: elsewhere it lies on something."""
+    rest = _at_rest(s)
+    return rest if rest is not None and abs(rest) <= OFF else None
 
 
 def _at_rest(s: Signals) -> float | None:
     """[rad] The reading of an arm that rests at first and is not held: the duty is 0, or changes without moving it."""
     known = np.flatnonzero(np.isfinite(s.theta))
     x = s.theta[known]
-    first = max(FEWEST, round(REST / s.period))
+    first = max(FEWEST, int(np.searchsorted(known * s.period, REST)))
     moved = np.abs(x - np.median(x[:first])) > STILL * s.sigma["theta"]
     stop = int(np.argmax(moved)) if moved.any() else len(x)
     held = s.duty[:int(known[min(stop, len(known) - 1)])]

@@ -93,6 +93,11 @@ Derived: a factor of four is two standard deviations, ln(4)/2."""
 FINDINGS = ("coulomb_friction",)
 """Effects that are identified with the nominal model but reported as missing in it (choice: as in a free decay)."""
 
+DAMPING_RATIO, DAMPING_SD = 0.05, math.log(10.0) / 1.96
+"""Median of the damping ratio of an arm, and standard deviation of its logarithm (choice: 95 % within a factor of ten).
+
+No arm swings for ever. Without such a prior a disturbance that a controller answers makes the damping 0."""
+
 REVERSE_SD = 0.3
 """Standard deviation of the share of the voltage that an uncalibrated bridge gives in reverse (choice: about alike)."""
 
@@ -112,7 +117,8 @@ def model_parameters(chains: CutChains, stage: str) -> list[Parameter]:
     """
     calibrated, recordings = chains.policy.calibrated, chains.recordings
     if not calibrated and angle_only(recordings):
-        return _of_each(_of_angle(chains.model, recordings), len(recordings)) if stage == "arm" else []
+        own = _of_each(_of_angle(chains.model, recordings), len(recordings)) if stage == "arm" else []
+        return [_as_it_hangs(p, chains.model, recordings) for p in own]
     parameters = []
     stages = [stage]
     if stage == "arm" and any(not s.has("omega") and not s.has("i_a") for s in recordings):
@@ -216,8 +222,9 @@ def _of_angle(model: Model, recordings: Sequence[Signals]) -> list[Parameter]:
         return Parameter(name, m[name], sd, max(p.low, 1e-12), p.high, log=True)
 
     slower = slowness(model)
+    damping = 2.0 * DAMPING_RATIO * math.sqrt(m["mgd_over_J"])
     arm = [log("mgd_over_J", 0.7),
-           Parameter("c_over_J", m["c_over_J"], max(m["c_over_J"], 0.3 / slower), 0.0, 1e3)]
+           Parameter("c_over_J", damping, DAMPING_SD, 1e-12, 1e3, max(m["c_over_J"], 1e-12), log=True)]
     if free_swinging(recordings):
         return [*arm, Parameter(ZERO, model.effect("angle_offset", "bias"), 0.3)]
     own = [_of_effect(name, model) for name in held(model)]
@@ -248,14 +255,21 @@ def refines(name: str) -> bool:
 
 
 def _of_effect(name: str, model: Model) -> Parameter:
-    """The size of an effect that the nominal model holds, or what refines it."""
-    size = DEFINED[key(name).owner].parameters[key(name).name]
+    """The size of an effect that the nominal model holds, or what refines it; the prior draws it to its absence."""
+    size, start = DEFINED[key(name).owner].parameters[key(name).name], model.effect(key(name).owner, key(name).name)
     if size.refines:
-        start = model.effect(key(name).owner, key(name).name)
         return Parameter(name, size.neutral, RATIO_SD, size.low, size.high, start, log=True)
     spread = SIZE_SD * abs(usual_size(key(name).owner, model) - size.neutral)
-    return Parameter(name, model.effect(key(name).owner, key(name).name), spread,
-                     0.0 if name == DELAY else size.low, size.high)
+    return Parameter(name, size.neutral, spread, 0.0 if name == DELAY else size.low, size.high, start)
+
+
+def _as_it_hangs(p: Parameter, model: Model, recordings: Sequence[Signals]) -> Parameter:
+    """The zero of the angle, with what the reading of an arm that hangs tells: dry friction may hold it beside."""
+    rest = recordings[key(p.name).recording].hanging if key(p.name).plain == ZERO else None
+    if rest is None:
+        return p
+    held = SIZE_SD * usual_size("coulomb_friction", model) / model.model["mgd_over_J"]
+    return replace(p, mean=rest, sd=held, start=p.begin)
 
 
 def slowness(model: Model) -> float:
