@@ -21,7 +21,7 @@ from aeropend_ident.diagnosis import gap_share, regions, typed_json
 from aeropend_ident.diagnosis.chain import static_map
 from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
 from aeropend_ident.diagnosis.chain.chain import CutChains
-from aeropend_ident.diagnosis.chain.driven_rig import fit_driven_rig, fit_own, without_findings
+from aeropend_ident.diagnosis.chain.driven_rig import DrivenRig, fit_driven_rig, fit_own, without_findings
 from aeropend_ident.diagnosis.chain.free_run import free_run
 from aeropend_ident.diagnosis.chain.hanging import mounted
 from aeropend_ident.diagnosis.chain.known import Known
@@ -57,6 +57,7 @@ from aeropend_ident.diagnosis.search.findings import Findings
 from aeropend_ident.diagnosis.search.learned_term import learn
 from aeropend_ident.diagnosis.search.search import refit, search, trifling_gap, unsearched
 from aeropend_ident.estimation.map_fit import passed
+from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import effect_file
 from aeropend_sim.model.parameters import Model
@@ -129,29 +130,38 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
     deadline = None if seconds is None else time.monotonic() + seconds
     with threadpool_limits(1):  # the matrices are narrow: threads of the linear algebra would slow each other down
         policy = policy_of(recordings, fit_nominal=fit_nominal)
-        likely: dict[str, float] = {}
-        plain = None
-        state: Mapping[str, float] = {}
-        notes: tuple[str, ...] = ()
+        rig: DrivenRig | None = None
         if fit_nominal:
             progress("identifying the nominal model", 0.0)
             if any(s.both_ways for s in recordings):
                 model = replace(model, model={**model.model, "reverse": 1.0})
             recordings = mounted(model, recordings)
+        name = f"{model.name}, identified"
         if policy.wide_search and angle_only(recordings):
             rig = fit_driven_rig(model, recordings, deadline, jobs)
-            found, likely = without_findings(rig, model, recordings, material)
-            model, plain, notes = replace(found, name=f"{model.name}, identified"), rig.plain, rig.notes
-            state = rig.state
         elif fit_nominal:
             model, recordings = fit_nominal_model(model, recordings, deadline)
         if policy.calibrated:
             _refuse_divergence(model, recordings)
-        kind = CutChains if policy.calibrated else CachedChains
-        chains = with_pwm_timing(kind(model, recordings, policy))
-        chains.likely, chains.state, chains.plain, chains.notes, chains.known = likely, state, plain, notes, known
-        chains.further, chains.left_out = tuple(further), tuple(left_out)
-        return _diagnose(chains, Settings(jobs, material, deadline), progress)
+
+        def diagnosed(m: Model, likely: Mapping[str, float]) -> Diagnosis:
+            kind = CutChains if policy.calibrated else CachedChains
+            chains = with_pwm_timing(kind(m, recordings, policy))
+            if rig is not None:
+                chains.state, chains.plain, chains.notes = rig.state, rig.plain, rig.notes
+            chains.likely, chains.known = likely, known
+            chains.further, chains.left_out = tuple(further), tuple(left_out)
+            return _diagnose(chains, Settings(jobs, material, deadline), progress)
+
+        if rig is None:
+            return diagnosed(model, {})
+        without, likely = without_findings(rig, model, recordings, material)
+        found = diagnosed(replace(without, name=name), likely)
+        if all(key(n).owner in found.augmented.effects for n in likely) or passed(deadline):
+            return found
+        again = diagnosed(replace(rig.model, name=name), {})  # what the search does not confirm stays in the model
+        cut = [n for n in found.signals[0].notes if n == CUT_SHORT and n not in again.signals[0].notes]
+        return replace(again, signals=[s.noted(*cut) for s in again.signals])
 
 
 def _refuse_divergence(model: Model, recordings: Sequence[Signals]) -> None:
@@ -272,7 +282,7 @@ def _without(found: Found, name: str) -> Found:
     for stage, f in found.stages.items():
         kept = tuple(s for s in f.found if s[0].hypothesis.name != name)
         if len(kept) < len(f.found):
-            final = refit(found.chains, stage, [s[0].hypothesis for s in kept], f.final.values)
+            final = refit(found.chains, stage, [s[0].hypothesis for s in kept], f.final.values, f.base)
             stages[stage] = replace(f, found=kept, final=final)
     detected = gust.detect(found.chains, stages["arm"])
     stages["arm"] = detected.arm

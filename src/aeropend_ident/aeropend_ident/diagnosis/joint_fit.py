@@ -22,7 +22,7 @@ from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
 from aeropend_ident.diagnosis.search.search import refit
 from aeropend_ident.diagnosis.search.selection import noise_over_spread
-from aeropend_ident.estimation.map_fit import Fit, Sensitivities, fit, sensitivities, within_bounds
+from aeropend_ident.estimation.map_fit import POORER, Fit, Sensitivities, fit, sensitivities, within_bounds
 from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.statistics import Z95, rms
@@ -283,7 +283,7 @@ def fit_jointly(chains: CutChains, findings: Mapping[str, Findings], *, gust: bo
     while not chains.policy.calibrated and (weak := _least_needed(chains.model, found, values, widened())):
         stage, selection = weak
         f = found[stage].without(selection)
-        found[stage] = replace(f, final=refit(chains, stage, f.effects, f.final.values))
+        found[stage] = replace(f, final=refit(chains, stage, f.effects, f.final.values, f.base))
         joint, values, sd, alone = _fitted(chains, found)
         checks = _checks(chains, found)
     return JointFit(chains, found, joint, values, widened(), checks, alone)
@@ -295,7 +295,12 @@ def _fitted(chains: CutChains, findings: Mapping[str, Findings]
     start: dict[str, float] = {}
     for f in findings.values():
         start.update(f.final.values)
-    joint = fit(chains.joined(_free_run_residuals), started(_parameters(chains, findings).values(), start))
+    residuals, parameters = chains.joined(_free_run_residuals), _parameters(chains, findings).values()
+    joint = fit(residuals, started(parameters, start))
+    base = findings["arm"].base if chains.policy.wide_search else None
+    if base is not None and joint.mean_square > POORER * base.mean_square:  # an effect that is gone led it astray
+        again = fit(residuals, started(parameters, {**start, **base.values}))
+        joint = min(joint, again, key=lambda one: one.mean_square)
     alone = _of_each_alone(chains, findings, joint)
     sd = {name: WIDER * s for name, s in joint.sd.items()}
     sd |= {name: max(sd[name], pooled_sd(estimates)) for name, estimates in alone.items()}

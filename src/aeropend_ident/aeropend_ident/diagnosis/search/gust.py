@@ -126,7 +126,7 @@ def _judged(chains: CutChains, final: Fit) -> RankedHypothesis | None:
 def _without_random(chains: CutChains, arm: Findings) -> Findings:
     """The findings without effects that are not needed beside a random torque, which resembles many an effect."""
     def without(now: Findings, h: Hypothesis) -> Fit:
-        return refit(chains, "arm", [e for e in now.effects if e is not h], now.final.values)
+        return refit(chains, "arm", [e for e in now.effects if e is not h], now.final.values, now.base)
 
     def lost(now: Findings, f: Fit) -> float:
         ess = largest_ess([now.final, f])

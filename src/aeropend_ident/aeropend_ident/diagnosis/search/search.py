@@ -40,7 +40,7 @@ from aeropend_ident.diagnosis.search.selection import (
     squared_gap,
 )
 from aeropend_ident.diagnosis.search.sets import compared, with_best_set
-from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess, passed
+from aeropend_ident.estimation.map_fit import POORER, Fit, fit, largest_ess, passed
 from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter, started
 
@@ -356,7 +356,8 @@ def _without_unneeded(chains: CutChains, findings: Findings, nominal: list[Param
     return drop_unneeded(findings, without, lost, least=1)
 
 
-def refit(chains: CutChains, stage: str, effects: Sequence[Hypothesis], start: Mapping[str, float]) -> Fit:
+def refit(chains: CutChains, stage: str, effects: Sequence[Hypothesis], start: Mapping[str, float],
+          base: Fit | None = None) -> Fit:
     """Fit a stage again with given effects.
 
     Args:
@@ -364,9 +365,17 @@ def refit(chains: CutChains, stage: str, effects: Sequence[Hypothesis], start: M
         stage: to be fitted.
         effects: of the stage.
         start: values to start from.
+        base: the fit without effects; one that ends worse starts from there as well, since an effect that is gone may
+            have led it into a local minimum.
     """
+    if base is not None and not effects:
+        return base
     parameters = [*nominal_parameters(chains, stage), *(p for h in effects for p in h.own)]
-    return fit(chains.residuals(stage), started(parameters, start))
+    f = fit(chains.residuals(stage), started(parameters, start))
+    if base is None or not f.residuals or f.mean_square <= POORER * base.mean_square:
+        return f
+    again = fit(chains.residuals(stage), started(parameters, {**start, **base.values}))
+    return min(f, again, key=lambda one: one.mean_square)
 
 
 def at_end_of_prior(chains: CutChains, stage: str, f: Fit) -> bool:
