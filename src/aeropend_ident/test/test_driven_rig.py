@@ -79,6 +79,15 @@ def test_dry_friction_of_a_slow_rig_is_found(gravity, friction):
     assert found.augmented.model["mgd_over_J"] == pytest.approx(gravity, rel=0.02)
 
 
+@pytest.mark.promise("Uncalibrated rigs", "Dry friction that the search does not confirm stays in the model")
+def test_dry_friction_that_is_not_found_as_an_effect_stays_in_the_model():
+    s, _ = with_friction()
+    found = diagnose(BENCH, [s], fit_nominal=True, left_out=["coulomb_friction"])
+    assert found.body["which"]["verdict"] == "none"
+    assert found.body["identified"]["own"]["coulomb_friction.accel"]["value"] == pytest.approx(0.8, rel=0.05)
+    assert found.body["channels"]["theta"]["fit_unseen"] > 0.95
+
+
 @pytest.mark.promise("Uncalibrated rigs", "Delay and zero of a rig are its own model and no effect")
 def test_delay_and_zero_are_the_rigs_own():
     s = driven({}, {"command_delay": {"delay": 0.1}}, zero=0.08)
