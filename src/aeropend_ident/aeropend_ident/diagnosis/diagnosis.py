@@ -144,24 +144,22 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
         if policy.calibrated:
             _refuse_divergence(model, recordings)
 
-        def diagnosed(m: Model, likely: Mapping[str, float]) -> Diagnosis:
+        def cut(m: Model) -> CutChains:
             kind = CutChains if policy.calibrated else CachedChains
             chains = with_pwm_timing(kind(m, recordings, policy))
             if rig is not None:
                 chains.state, chains.plain, chains.notes = rig.state, rig.plain, rig.notes
-            chains.likely, chains.known = likely, known
-            chains.further, chains.left_out = tuple(further), tuple(left_out)
-            return _diagnose(chains, Settings(jobs, material, deadline), progress)
+            chains.known, chains.further, chains.left_out = known, tuple(further), tuple(left_out)
+            return chains
 
         if rig is None:
-            return diagnosed(model, {})
-        without, likely = without_findings(rig, model, recordings, material)
-        found = diagnosed(replace(without, name=name), likely)
-        if all(key(n).owner in found.augmented.effects for n in likely) or passed(deadline):
-            return found
-        again = diagnosed(replace(rig.model, name=name), {})  # what the search does not confirm stays in the model
-        cut = [n for n in found.signals[0].notes if n == CUT_SHORT and n not in again.signals[0].notes]
-        return replace(again, signals=[s.noted(*cut) for s in again.signals])
+            chains = cut(model)
+        else:
+            without, likely = without_findings(rig, model, recordings, material)
+            chains = cut(replace(without, name=name))
+            if likely:
+                chains.likely, chains.with_likely = likely, cut(replace(rig.model, name=name))
+        return _diagnose(chains, Settings(jobs, material, deadline), progress)
 
 
 def _refuse_divergence(model: Model, recordings: Sequence[Signals]) -> None:
@@ -185,6 +183,10 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     if found.unknown is not None and found.unknown.stage in closed:
         found = _judged(found, closed)
     now = _without_harmful(fitted, found, joint, gaps, settings, progress)
+    if fitted.with_likely is not None and not (_confirms(now, fitted.likely) or passed(settings.deadline)):
+        again = fitted.with_likely  # what the search does not confirm stays in the model
+        again.notes = (*again.notes, *(note for note in found.recordings[0].notes if note == CUT_SHORT))
+        return _diagnose(again, settings, progress)
     if now.found.unknown is not None and not _repeats(now.parts, settings.material):
         known = replace(now.found, unknown=None)
         now = now._replace(found=known, parts=parts_of(known, now.joint, now.gaps, settings))
@@ -203,6 +205,12 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     measured = model if chains.policy.calibrated else replace(model, sensing=own_sensing(model, found.recordings))
     return Diagnosis(nominal, _augmented(measured, joint.values_of_rig, found.statistical), found.recordings,
                      gaps.runs_before, gaps.runs_after, conclusions(now, settings), found.misfit)
+
+
+def _confirms(now: Measured, likely: Mapping[str, float]) -> bool:
+    """Whether the effects that the rig was identified with were found."""
+    found = {h.family for f in now.joint.findings.values() for h in f.effects}
+    return {key(name).owner for name in likely} <= found
 
 
 def _changes_later(gaps: Gaps) -> bool:

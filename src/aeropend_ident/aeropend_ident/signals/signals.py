@@ -137,8 +137,8 @@ class Signals:
                        v_a=self.v_a[:n], pulses=p, false_speed=self.false_speed[:n], train=min(self.train, n))
 
     def noted(self, *notes: str) -> Signals:
-        """The same recording with further notes."""
-        return replace(self, notes=(*self.notes, *notes))
+        """The same recording with further notes, each once."""
+        return replace(self, notes=tuple(dict.fromkeys((*self.notes, *notes))))
 
     def acting(self, stop: int | None = None) -> list[tuple[slice, bool]]:
         """The pieces of the recording, and whether the effects that the model lacks act in each.

@@ -278,6 +278,7 @@ class CutChains:
     def __init__(self, model: Model, recordings: Sequence[Signals], policy: Policy = CALIBRATED) -> None:
         self.model, self.policy = model, policy
         self.likely: Mapping[str, float] = {}  # sizes of effects with which the parameters were identified
+        self.with_likely: CutChains | None = None  # the chains of the model that holds these effects
         self.state: Mapping[str, float] = {}  # initial states from which fits start
         self.plain: Model | None = None  # the best nominal model without further terms, of a driven rig
         self.known: Known | None = None  # what earlier verdicts know of the rig
