@@ -68,6 +68,13 @@ def test_the_scale_of_duty_and_time_changes_the_units_alone(time, duty):
     assert units_of(BENCH, [other]).time * time == pytest.approx(units_of(BENCH, [s]).time, rel=0.3)
 
 
+@pytest.mark.parametrize("friction", [0.0, 0.6, 1.0])
+def test_dry_friction_does_not_hide_gravity_when_the_scale_of_time_is_found(friction):
+    numbers = {"mgd_over_J": 8.5, "c_over_J": 1.0, "L_over_J": BENCH.model["L_over_J"] * 8.5 / 33.8}
+    s = driven(numbers, {"coulomb_friction": {"accel": friction}}, seconds=60.0, hold=(1.0, 4.0))
+    assert 33.8 * units_of(BENCH, [s]).time ** 2 == pytest.approx(8.5, rel=0.3)
+
+
 @pytest.mark.promise("Uncalibrated rigs", "Dry friction of a slow rig is found within some percent")
 @pytest.mark.parametrize(("gravity", "friction"), [(1.7, 0.03), (4.3, 0.05)])
 def test_dry_friction_of_a_slow_rig_is_found(gravity, friction):

@@ -214,7 +214,8 @@ def _unseen(model: Model, recordings: Sequence[Signals], state: Mapping[str, flo
 def units_of(model: Model, recordings: Sequence[Signals]) -> Units:
     """The units of a rig, from gravity by the weak form at the fastest time scale that resembles the bench's.
 
-    On a faster scale noise hides gravity, and it is found too small; on a slower one the arm only follows its duty.
+    On a faster scale noise hides gravity, and it is found too small; on a slower one the arm only follows its duty. Dry
+    friction hides it too: of the regressions with and without, that with more gravity counts.
     """
     duty = 1.0 / max(s.largest_duty for s in recordings)
     found = []
@@ -223,9 +224,10 @@ def units_of(model: Model, recordings: Sequence[Signals]) -> Units:
         tried = [downsampled(units.of(s)) for s in recordings]
         if not SHORTEST <= sum(map(len, tried)) <= LONGEST:
             continue
-        likely = likeliest(model, tried, [WeakForm(s) for s in tried], few=True)
+        both = likeliest(model, tried, [WeakForm(s) for s in tried], few=True)
+        likely = [starts[0].model for starts in both if starts]
         if likely:
-            gravity = likely[0].model.model["mgd_over_J"] / REFERENCE_GRAVITY
+            gravity = max(m.model["mgd_over_J"] for m in likely) / REFERENCE_GRAVITY
             units = replace(units, time=units.time * math.sqrt(gravity))
             if gravity >= RESEMBLES:
                 return units
@@ -267,7 +269,7 @@ class _TermSearch:
         coarse = [downsampled(s) for s in self.recordings]
         tests = [WeakForm(s) for s in coarse]
         kinds = (False, True) if "coulomb_friction" not in self.keep else (False,)
-        starts = [likeliest(model, coarse, tests, friction=friction) for friction in kinds]
+        starts = likeliest(model, coarse, tests, kinds=kinds)
         begun: list[Fitted] = []
         for found in starts:
             best = {s.lag: s.model for s in reversed(found)}

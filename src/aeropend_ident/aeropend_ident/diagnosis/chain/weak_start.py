@@ -81,33 +81,38 @@ class Start:
 
 
 def likeliest(model: Model, recordings: Sequence[Signals], tests: Sequence[WeakForm], *, few: bool = False,
-              friction: bool = False) -> list[Start]:
-    """Static curves and lags, the likeliest first.
+              kinds: Sequence[bool] = (False, True)) -> list[list[Start]]:
+    """Static curves and lags, the likeliest first: a list for each kind.
 
     Args:
         model: gives the rest.
         recordings: duty and angle.
         tests: of the recordings.
         few: only the first and last dead zone and bend, and the first load.
-        friction: with dry friction and the zero of the angle, from the stretches in which the arm moves.
+        kinds: whether with dry friction and the zero of the angle, from the stretches in which the arm moves.
     """
-    found = []
+    found: list[list[Start]] = [[] for _ in kinds]
     grid = (DEAD_ZONES[::2], BENDS[::2], LOADS[:1], LAGS) if few else (DEAD_ZONES, BENDS, LOADS, LAGS)
     for dead, bend, load, lag in product(*grid):
-        numbers = curve(model.model, dead, bend, load, lag)
-        m = replace(model, model=numbers)
-        r = regress(tests, [unit_lift(m, s) for s in recordings], friction=friction)
-        if r.gravity <= 0.5 or r.gain <= 0.0 or (friction and r.friction <= 0.0):
-            continue
-        numbers = {**numbers, "mgd_over_J": min(r.gravity, 5e3), "c_over_J": min(max(r.damping, 0.05), 100.0),
-                   "L_over_J": min(r.gain / numbers["k_thrust"], 1e5)}
-        effects = {**m.effects}
-        if friction:
-            bias = CATALOGUE["angle_offset"].parameters["bias"]
-            effects = {"coulomb_friction": {"accel": r.friction},
-                       "angle_offset": {"bias": min(max(r.zero, 0.5 * bias.low), 0.5 * bias.high)}, **effects}
-        found.append(Start(r.left, lag, replace(m, model=numbers, effects=effects)))
-    return sorted(found, key=lambda start: start.left)
+        m = replace(model, model=curve(model.model, dead, bend, load, lag))
+        lifts = [unit_lift(m, s) for s in recordings]
+        for of_kind, friction in zip(found, kinds, strict=True):
+            r = regress(tests, lifts, friction=friction)
+            if r.gravity > 0.5 and r.gain > 0.0 and (r.friction > 0.0 or not friction):
+                of_kind.append(Start(r.left, lag, _regressed(m, r, friction=friction)))
+    return [sorted(of_kind, key=lambda start: start.left) for of_kind in found]
+
+
+def _regressed(m: Model, r: Regression, *, friction: bool) -> Model:
+    """A model with the numbers of a regression, within the ranges that a search may start from."""
+    numbers = {**m.model, "mgd_over_J": min(r.gravity, 5e3), "c_over_J": min(max(r.damping, 0.05), 100.0),
+               "L_over_J": min(r.gain / m.model["k_thrust"], 1e5)}
+    if not friction:
+        return replace(m, model=numbers)
+    bias = CATALOGUE["angle_offset"].parameters["bias"]
+    effects = {"coulomb_friction": {"accel": r.friction},
+               "angle_offset": {"bias": min(max(r.zero, 0.5 * bias.low), 0.5 * bias.high)}, **m.effects}
+    return replace(m, model=numbers, effects=effects)
 
 
 def curve(numbers: Mapping[str, float], dead: float, bend: float, load: float, lag: float) -> dict[str, float]:
