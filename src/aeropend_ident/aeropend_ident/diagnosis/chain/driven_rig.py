@@ -51,6 +51,11 @@ OCTAVES = range(5, -6, -1)
 RESEMBLES = 1.0 / 3.0
 """Gravity, over that of the bench, from which a rig resembles the bench in a time scale (choice: within an octave)."""
 
+HIDDEN = 2.0
+"""Ratio of the gravity of a regression with dry friction to that of one without, above which the friction hid it.
+
+Choice: below, both give about the same time scale, 1.4 times at most."""
+
 LONGEST, SHORTEST = 16000, 200
 """Samples of a recording in a time scale that is tried, at most and at least (choice: time, and some swings)."""
 
@@ -215,7 +220,7 @@ def units_of(model: Model, recordings: Sequence[Signals]) -> Units:
     """The units of a rig, from gravity by the weak form at the fastest time scale that resembles the bench's.
 
     On a faster scale noise hides gravity, and it is found too small; on a slower one the arm only follows its duty. Dry
-    friction hides it too: of the regressions with and without, that with more gravity counts.
+    friction hides it too: a regression with friction counts if it gives `HIDDEN` times as much.
     """
     duty = 1.0 / max(s.largest_duty for s in recordings)
     found = []
@@ -224,10 +229,10 @@ def units_of(model: Model, recordings: Sequence[Signals]) -> Units:
         tried = [downsampled(units.of(s)) for s in recordings]
         if not SHORTEST <= sum(map(len, tried)) <= LONGEST:
             continue
-        both = likeliest(model, tried, [WeakForm(s) for s in tried], few=True)
-        likely = [starts[0].model for starts in both if starts]
-        if likely:
-            gravity = max(m.model["mgd_over_J"] for m in likely) / REFERENCE_GRAVITY
+        smooth, rubbing = (starts[0].model.model["mgd_over_J"] if starts else 0.0
+                           for starts in likeliest(model, tried, [WeakForm(s) for s in tried], few=True))
+        gravity = (rubbing if rubbing > HIDDEN * smooth else smooth) / REFERENCE_GRAVITY
+        if gravity > 0.0:
             units = replace(units, time=units.time * math.sqrt(gravity))
             if gravity >= RESEMBLES:
                 return units
