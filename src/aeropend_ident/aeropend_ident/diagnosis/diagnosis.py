@@ -136,29 +136,21 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
             if any(s.both_ways for s in recordings):
                 model = replace(model, model={**model.model, "reverse": 1.0})
             recordings = mounted(model, recordings)
-        name = f"{model.name}, identified"
+        likely: dict[str, float] = {}
         if policy.wide_search and angle_only(recordings):
             rig = fit_driven_rig(model, recordings, deadline, jobs)
+            without, likely = without_findings(rig, model, recordings, material)
+            model = replace(without, name=f"{model.name}, identified")
         elif fit_nominal:
             model, recordings = fit_nominal_model(model, recordings, deadline)
         if policy.calibrated:
             _refuse_divergence(model, recordings)
-
-        def cut(m: Model) -> CutChains:
-            kind = CutChains if policy.calibrated else CachedChains
-            chains = with_pwm_timing(kind(m, recordings, policy))
-            if rig is not None:
-                chains.state, chains.plain, chains.notes = rig.state, rig.plain, rig.notes
-            chains.known, chains.further, chains.left_out = known, tuple(further), tuple(left_out)
-            return chains
-
-        if rig is None:
-            chains = cut(model)
-        else:
-            without, likely = without_findings(rig, model, recordings, material)
-            chains = cut(replace(without, name=name))
-            if likely:
-                chains.likely, chains.with_likely = likely, cut(replace(rig.model, name=name))
+        kind = CutChains if policy.calibrated else CachedChains
+        chains = with_pwm_timing(kind(model, recordings, policy))
+        if rig is not None:
+            chains.state, chains.plain, chains.notes = rig.state, rig.plain, rig.notes
+            chains.likely, chains.with_likely = likely, replace(rig.model, name=model.name)
+        chains.known, chains.further, chains.left_out = known, tuple(further), tuple(left_out)
         return _diagnose(chains, Settings(jobs, material, deadline), progress)
 
 
@@ -183,8 +175,9 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
     if found.unknown is not None and found.unknown.stage in closed:
         found = _judged(found, closed)
     now = _without_harmful(fitted, found, joint, gaps, settings, progress)
-    if fitted.with_likely is not None and not (_confirms(now, fitted.likely) or passed(settings.deadline)):
-        again = fitted.with_likely  # what the search does not confirm stays in the model
+    if not (_confirms(now, fitted.likely) or passed(settings.deadline)):  # what is not confirmed stays in the model
+        again = fitted.anew(fitted.recordings, fitted.with_likely)
+        again.likely = {}
         again.notes = (*again.notes, *(note for note in found.recordings[0].notes if note == CUT_SHORT))
         return _diagnose(again, settings, progress)
     if now.found.unknown is not None and not _repeats(now.parts, settings.material):

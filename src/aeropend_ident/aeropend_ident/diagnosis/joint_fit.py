@@ -22,7 +22,7 @@ from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
 from aeropend_ident.diagnosis.search.search import refit
 from aeropend_ident.diagnosis.search.selection import noise_over_spread
-from aeropend_ident.estimation.map_fit import POORER, Fit, Sensitivities, fit, sensitivities, within_bounds
+from aeropend_ident.estimation.map_fit import Fit, Sensitivities, fit, fit_again, sensitivities, within_bounds
 from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.statistics import Z95, rms
@@ -295,12 +295,8 @@ def _fitted(chains: CutChains, findings: Mapping[str, Findings]
     start: dict[str, float] = {}
     for f in findings.values():
         start.update(f.final.values)
-    residuals, parameters = chains.joined(_free_run_residuals), _parameters(chains, findings).values()
-    joint = fit(residuals, started(parameters, start))
     base = findings["arm"].base if chains.policy.wide_search else None
-    if base is not None and joint.mean_square > POORER * base.mean_square:  # an effect that is gone led it astray
-        again = fit(residuals, started(parameters, {**start, **base.values}))
-        joint = min(joint, again, key=lambda one: one.mean_square)
+    joint = fit_again(chains.joined(_free_run_residuals), list(_parameters(chains, findings).values()), start, base)
     alone = _of_each_alone(chains, findings, joint)
     sd = {name: WIDER * s for name, s in joint.sd.items()}
     sd |= {name: max(sd[name], pooled_sd(estimates)) for name, estimates in alone.items()}

@@ -475,6 +475,24 @@ def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence
     return Fit(values, sd, search.current, search.scale, search.ess, log_prior, products, search.prior)
 
 
+def fit_again(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter],
+              start: Mapping[str, float], base: Fit | None = None) -> Fit:
+    """Fit from given values, and also from those of a fit with fewer parameters if it ends worse than that one.
+
+    What is gone may have led the values into a local minimum.
+
+    Args:
+        residuals: as in `fit`.
+        parameters: as in `fit`.
+        start: values to start from.
+        base: the fit with fewer parameters; None: it is not asked.
+    """
+    f = fit(residuals, started(parameters, start))
+    if base is None or not f.residuals or f.mean_square <= POORER * base.mean_square:
+        return f
+    return min(f, fit(residuals, started(parameters, {**start, **base.values})), key=lambda one: one.mean_square)
+
+
 def with_posterior_slopes(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter], f: Fit
                           ) -> Fit:
     """A fit whose information is that of slopes over the posterior, from one standard deviation below to one above.

@@ -278,7 +278,7 @@ class CutChains:
     def __init__(self, model: Model, recordings: Sequence[Signals], policy: Policy = CALIBRATED) -> None:
         self.model, self.policy = model, policy
         self.likely: Mapping[str, float] = {}  # sizes of effects with which the parameters were identified
-        self.with_likely: CutChains | None = None  # the chains of the model that holds these effects
+        self.with_likely: Model | None = None  # the nominal model that holds these effects
         self.state: Mapping[str, float] = {}  # initial states from which fits start
         self.plain: Model | None = None  # the best nominal model without further terms, of a driven rig
         self.known: Known | None = None  # what earlier verdicts know of the rig
@@ -287,13 +287,14 @@ class CutChains:
         self.notes: tuple[str, ...] = ()  # what the recordings do not tell of the nominal model of a driven rig
         self.each = [self._cut(signals) for signals in recordings]
 
-    def anew(self, recordings: Sequence[Signals]) -> CutChains:
+    def anew(self, recordings: Sequence[Signals], model: Model | None = None) -> CutChains:
         """The same chains cut from other recordings, with all that is known and tried.
 
         Args:
             recordings: of the same rig.
+            model: the nominal model; None: the same.
         """
-        out = type(self)(self.model, recordings, self.policy)
+        out = type(self)(model or self.model, recordings, self.policy)
         for name in ("likely", "state", "plain", "known", "further", "left_out", "notes"):
             setattr(out, name, getattr(self, name))
         return out

@@ -245,11 +245,6 @@ def _usual(name: str, m: Model) -> float:
     return 1.0 if refines(name) else usual_size(key(name).owner, m) - absent_at(name)
 
 
-def _first_size(name: str, m: Model) -> float:
-    """The size of a term from which a fit with every term starts."""
-    return absent_at(name) + FIRST_SIZE * _usual(name, m)
-
-
 @dataclass(frozen=True)
 class _TermSearch:
     """The search for the terms of the nominal model.
@@ -290,8 +285,9 @@ class _TermSearch:
 
     def _completed(self, m: Model) -> Model:
         """A model with the terms that it lacks, at the sizes from which a fit starts."""
-        lacking = [n for n in CHOSEN if n not in held(m) and key(n).owner not in self.keep]
-        return with_values(m, {n: _first_size(n, m) for n in lacking})
+        there = held(m)
+        lacking = [n for n in CHOSEN if n not in there and key(n).owner not in self.keep]
+        return with_values(m, {n: absent_at(n) + FIRST_SIZE * _usual(n, m) for n in lacking})
 
     def _over_growing_horizons(self, models: Sequence[Model]) -> Fitted:
         """The best of some starts after fits over the beginning, then over more and more, while there is time."""

@@ -40,7 +40,7 @@ from aeropend_ident.diagnosis.search.selection import (
     squared_gap,
 )
 from aeropend_ident.diagnosis.search.sets import compared, with_best_set
-from aeropend_ident.estimation.map_fit import POORER, Fit, fit, largest_ess, passed
+from aeropend_ident.estimation.map_fit import Fit, fit, fit_again, largest_ess, passed
 from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter, started
 
@@ -365,17 +365,12 @@ def refit(chains: CutChains, stage: str, effects: Sequence[Hypothesis], start: M
         stage: to be fitted.
         effects: of the stage.
         start: values to start from.
-        base: the fit without effects; one that ends worse starts from there as well, since an effect that is gone may
-            have led it into a local minimum.
+        base: the fit without effects, see `fit_again`.
     """
     if base is not None and not effects:
         return base
     parameters = [*nominal_parameters(chains, stage), *(p for h in effects for p in h.own)]
-    f = fit(chains.residuals(stage), started(parameters, start))
-    if base is None or not f.residuals or f.mean_square <= POORER * base.mean_square:
-        return f
-    again = fit(chains.residuals(stage), started(parameters, {**start, **base.values}))
-    return min(f, again, key=lambda one: one.mean_square)
+    return fit_again(chains.residuals(stage), parameters, start, base)
 
 
 def at_end_of_prior(chains: CutChains, stage: str, f: Fit) -> bool:
