@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The nominal model of a driven rig with angle and command alone, in the rig's own units."""
 
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -9,6 +10,8 @@ import pytest
 
 from aeropend_ident.diagnosis.chain.driven_rig import Units, fit_driven_rig, fit_own, units_of
 from aeropend_ident.diagnosis.chain.hanging import mounted
+from aeropend_ident.diagnosis.chain.priors import DAMPING_RATIO
+from aeropend_ident.diagnosis.chain.values import AT_REST, at_rest, with_values
 from aeropend_ident.diagnosis.chain.weak_start import FULL, curve
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.signals.from_bag import end_of_motion
@@ -102,6 +105,22 @@ def test_delay_and_zero_are_the_rigs_own():
     assert body["which"]["verdict"] == "none"
     assert body["identified"]["own"]["command_delay.delay"]["value"] == pytest.approx(0.1, abs=0.02)
     assert body["identified"]["hangs_at"]["value"] == pytest.approx(0.08, abs=0.005)
+
+
+@pytest.mark.parametrize(("delay", "zero"), [(0.1, 0.08), (0.15, 0.05), (0.08, -0.1)])
+def test_terms_that_the_static_curve_could_stand_in_for_are_found_to_the_noise(delay, zero):
+    (s,) = mounted(BENCH, [driven({}, {"command_delay": {"delay": delay}}, zero=zero)])
+    rig = fit_driven_rig(BENCH, [s])
+    assert fit_own(rig.model, [s], state=rig.state).mean_square < 1.1
+    assert set(rig.model.effects) == {"command_delay", "angle_offset"}
+    assert rig.model.effect("command_delay", "delay") == pytest.approx(delay, abs=0.02)
+
+
+def test_the_map_gives_nothing_at_a_duty_of_0_wherever_a_fit_goes():
+    moved = with_values(BENCH, {AT_REST: -0.2, "k3": 3.0 * BENCH.model["k3"]})
+    assert at_rest(moved) == pytest.approx(-0.2)
+    assert actuator.voltage(moved.model, 0.0) == 0.0
+    assert with_values(BENCH, {AT_REST: at_rest(BENCH)}).model == pytest.approx(BENCH.model)
 
 
 LAGS = {"command_delay": {"delay": 0.1}, "thrust_lag": {"tau": 0.1}}
@@ -255,4 +274,5 @@ def in_closed_loop(damping: float, seed: int, size: float = 2.0, correlated: flo
 @pytest.mark.parametrize("seed", [0, 2])
 def test_a_disturbance_that_a_controller_answers_does_not_make_the_damping_zero(seed):
     (s,) = mounted(BENCH, [in_closed_loop(0.8, seed)])
-    assert fit_driven_rig(BENCH, [s]).model.model["c_over_J"] > 0.1 * 0.8
+    found = fit_driven_rig(BENCH, [s]).model.model
+    assert found["c_over_J"] > 2.0 * 0.1 * DAMPING_RATIO * math.sqrt(found["mgd_over_J"])  # 95 % of the prior

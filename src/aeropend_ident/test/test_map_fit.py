@@ -2,7 +2,16 @@
 import numpy as np
 import pytest
 
-from aeropend_ident.estimation.map_fit import LARGEST, Sensitivities, covariance_of, finite, fit, screen, whittle
+from aeropend_ident.estimation.map_fit import (
+    LARGEST,
+    Search,
+    Sensitivities,
+    covariance_of,
+    finite,
+    fit,
+    screen,
+    whittle,
+)
 from aeropend_ident.estimation.parameter import Parameter
 from aeropend_ident.signals.statistics import effective_sample_size
 
@@ -101,6 +110,28 @@ def test_corrected_derivatives_hold_along_the_step_and_stay_across_it():
     across = np.array([0.1, 0.2, 0.0])
     assert across @ step[by] == pytest.approx(0.0)
     assert corrected.rows.T @ across == pytest.approx(rows.T @ across)
+
+
+def test_a_fit_follows_a_narrow_curved_valley_to_its_end():
+    along, across, noise = np.random.default_rng(4).standard_normal((3, 2000))
+
+    def valley(values):
+        x, y = values["x"], values["y"]
+        return {"r": noise + 3.0 * (1.0 - x) * along + 300.0 * (y - x * x) * across}
+
+    found = fit(valley, [Parameter("x", 0.0, 100.0, start=-1.2), Parameter("y", 0.0, 100.0, start=1.44)], 10, 8)
+    assert [found.values[n] for n in "xy"] == pytest.approx([1.0, 1.0], abs=0.1)  # straight steps end at x = 0.3
+
+
+def test_a_step_that_ends_at_a_bound_is_the_best_one_for_the_others():
+    x = np.vstack([np.sin(T), np.sin(T) + 0.1 * np.cos(T)])
+    parameters = [Parameter("a", 0.0, 1e3, -10.0, 0.5), Parameter("b", 0.0, 1e3)]
+    y = x.T @ [2.0, 1.0]
+    search = Search(lambda values: {"y": y - x.T @ [values["a"], values["b"]]}, parameters)
+    information, gradient, _ = search.normal_equations(search.jacobian())
+    a, b = (1e3 * search.step(information, gradient)).tolist()
+    assert a == pytest.approx(0.5)
+    assert b == pytest.approx(float(x[1] @ (y - 0.5 * x[0]) / (x[1] @ x[1])), rel=1e-3)
 
 
 def test_few_derivatives_are_computed_where_the_model_is_nearly_linear():

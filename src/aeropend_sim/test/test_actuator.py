@@ -7,7 +7,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from aeropend_sim.model import actuator, dynamics
-from aeropend_sim.model.parameters import PRESETS, SAMPLE_PERIOD, load
+from aeropend_sim.model.parameters import PRESETS, SAMPLE_PERIOD, Model, load
 
 BENCH, THESIS = (load(preset).model for preset in ("bench", "thesis"))
 presets = st.sampled_from([BENCH, THESIS])
@@ -134,6 +134,16 @@ def current(v, delay=0.0):
 def test_delay_leads_the_winding_where_a_switch_within_the_hold_does(delay):
     late = acting({"command_delay": {"delay": delay}})
     assert current(late) == pytest.approx(current(actuator.voltage(BENCH, DUTY), delay), abs=1e-9)
+
+
+@pytest.mark.parametrize("part", [0.2, 0.5, 0.9])
+def test_delay_within_a_long_hold_turns_the_rotor_as_late_as_over_short_holds(part):
+    period, fine = 0.02, 40
+    late = Model("late", BENCH, load("bench").sensing, {"command_delay": {"delay": (3.0 + part) * period}})
+    duty = np.repeat([0.1, 0.6, 0.3], 25)
+    coarse, true = (dynamics.simulate(late, np.repeat(duty, n), period / n).omega[::n] for n in (1, fine))
+    of_delay = true - dynamics.simulate(late.with_effects({}), duty, period).omega
+    assert np.abs(coarse - true).max() < 0.06 * np.abs(of_delay).max()
 
 
 @given(whole=st.integers(0, 40), part=st.floats(0.01, 0.99), before=st.floats(0.0, 1.0))

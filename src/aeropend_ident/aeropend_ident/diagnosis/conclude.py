@@ -132,14 +132,14 @@ def parameter_rows(chains: CutChains, joint: JointFit) -> dict[str, ParameterRow
         return {n: _with_runs(row, n, joint) for n, row in rows.items()}
     fitted = {p.name: p for stage in STAGES for p in model_parameters(chains, stage)}
     alone = angle_only(chains.recordings)
-    rows = {}
+    rows, found = {}, with_values(chains.model, of_rig(values)).model
     left_out = {name for name in (*OPTIONAL, *DUTY_MAP) if nominal[name] == 0.0}
     for n in (name for name in MODEL_NAMES if name not in left_out):
         ends = limits(n)
         p = fitted.get(n, Parameter(n, nominal[n], UNCALIBRATED_SD, ends.low, ends.high, log=nominal[n] > 0.0))
         # with the angle alone, only the curve from duty to lift is identifiable, not its parameters
         known = n in fitted and (n in OF_THE_ARM or not alone)
-        value = values.get(n, nominal[n])
+        value = found[n]
         spread = sd[n] if known else UNCALIBRATED_SD * abs(value)
         prior = p.sd * (value if p.log else 1.0)
         if p.log and value > 0.0:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from aeropend_sim.compiled import njit
 from aeropend_sim.model.effects import DEFINED
-from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+from aeropend_sim.model.parameters import LONGEST_STEP, SAMPLE_PERIOD, Model
 from aeropend_sim.model.terms import series
 
 Array = NDArray[np.float64]
@@ -131,7 +131,7 @@ def voltages(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[str, f
 
 
 def acting(first: ArrayLike, then: ArrayLike, share: float) -> Array:
-    """Voltage (V) that drives the winding to the same current as one voltage, and another one after it."""
+    """Voltage (V) over a hold that does the same as one voltage, and another one after it (`share_of_first`)."""
     return np.asarray(share * np.asarray(first) + (1.0 - share) * np.asarray(then))
 
 
@@ -156,11 +156,16 @@ def held_voltage(m: DutyMap, duty: float, before: float, share: float, time: flo
 def share_of_first(numbers: Numbers, part: float, period: float) -> float:
     """Weight of the voltage before a change within a hold, for `acting`.
 
+    It gives the winding the same current at the end of the hold. Over a hold of several steps it gives the same mean
+    voltage instead: the current then follows within the hold, and its mean is what turns the rotor.
+
     Args:
         numbers: parameters of the model.
         part: share of the hold before the change.
         period: [s] length of the hold.
     """
+    if period > LONGEST_STEP:
+        return part
     lengths = period * numbers["R_a"] / numbers["L_a"]  # of the hold, in time constants of the winding
     return math.expm1(part * lengths) / math.expm1(lengths) if lengths < 500.0 else 0.0
 
@@ -169,8 +174,8 @@ def acting_voltage(numbers: Numbers, duty: Array, effects: Mapping[str, Mapping[
                    period: float, start: int = 0, before: float = 0.0) -> Array:
     """Voltage at the bridge over each hold of a duty series, with the effects that need no state.
 
-    If a delay is not a whole number of periods, the voltage changes within a hold. The result is then the constant
-    voltage that drives the winding to the same current. `supply_sag` needs the current; see `terminal_voltage`.
+    If a delay is not a whole number of periods, the voltage changes within a hold. The result is then a constant
+    voltage that does the same (`share_of_first`). `supply_sag` needs the current; see `terminal_voltage`.
 
     Args:
         numbers: parameters of the model.

@@ -14,13 +14,10 @@ from aeropend_sim.compiled import njit
 from aeropend_sim.model import actuator
 from aeropend_sim.model.effects import NO_EFFECT, THRUST_PIVOT_SPEED, Values, values
 from aeropend_sim.model.lag import NO_LAG, Lag, lag
-from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+from aeropend_sim.model.parameters import LONGEST_STEP, SAMPLE_PERIOD, Model
 from aeropend_sim.model.terms import EMPTY, NUDGE, Quantities, Terms, term_sum, terms
 
 Array = NDArray[np.float64]
-
-LONGEST_STEP = 2.5e-3
-"""[s] Longest step. Measured: over a longer one the error exceeds 2e-5 of the range of each state of `bench`."""
 
 LONGEST_ARM_STEP = 10e-3
 """[s] Longest step of the arm alone while it does not reverse against dry friction.

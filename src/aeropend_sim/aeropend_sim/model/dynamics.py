@@ -20,7 +20,6 @@ from aeropend_sim.model import actuator
 from aeropend_sim.model.arm import advance_arm, has_dry_friction
 from aeropend_sim.model.coefficients import (
     LONGEST_ARM_STEP,
-    LONGEST_STEP,
     Coefficients,
     Extra,
     model_parts,
@@ -31,7 +30,7 @@ from aeropend_sim.model.coefficients import (
 )
 from aeropend_sim.model.effects import Values
 from aeropend_sim.model.motor import advance_motor, at_terminals
-from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
+from aeropend_sim.model.parameters import LONGEST_STEP, SAMPLE_PERIOD, Model
 from aeropend_sim.model.state import Past, Pasts, State, quantities, since
 from aeropend_sim.model.terms import Quantities, Terms, remembered
 

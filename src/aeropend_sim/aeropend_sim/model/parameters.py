@@ -21,6 +21,9 @@ from aeropend_sim.untrusted import NumberLoader, load_yaml, printable
 SAMPLE_PERIOD = 64 * 510 / 16e6
 """[s] Sample period: Timer1 of a 16 MHz ATmega2560, 8-bit phase-correct PWM, prescaler 64 (thesis 4.3.2)."""
 
+LONGEST_STEP = 2.5e-3
+"""[s] Longest step. Measured: over a longer one the error exceeds 2e-5 of the range of each state of `bench`."""
+
 PRESETS = ("bench", "thesis")
 
 SECTIONS = ("model", "sensing", "definitions", "effects")

@@ -9,6 +9,7 @@ units in which every rig resembles the same one, so that neither the scale of th
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -39,9 +40,8 @@ from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import actuator
-from aeropend_sim.model.coefficients import LONGEST_STEP
 from aeropend_sim.model.effects import DEFINED, THRUST_PIVOT_SPEED
-from aeropend_sim.model.parameters import Model
+from aeropend_sim.model.parameters import LONGEST_STEP, Model
 
 Array = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ NOTHING = 0.01
 FIRST_SIZE = 0.2
 """Size, in default sizes, of the other terms from which their fit starts (choice)."""
 
-HORIZONS, FOLLOWED = (0.15, 0.35, 1.0), (4, 4, 1)
+HORIZONS, FOLLOWED = (0.15, 0.3, 0.6, 1.0), (3, 3, 3, 1)
 """Parts of the fitted data over which a fit is made one after the other, and fits that are followed after each.
 
 Choice: over a long horizon a poor start leads into a local minimum."""
@@ -162,8 +162,6 @@ def fit_driven_rig(model: Model, recordings: Sequence[Signals], deadline: float 
     search = _TermSearch(scaled, frozenset(model.effects), deadline, jobs)
     full, plain = search.with_every_term(begun)
     chosen = None if full is None else search.simplified(full)
-    if chosen is not None:
-        chosen = search.refined(begun, chosen)
     best = chosen or plain
     begun = units.model(best.model, back=True)
     found, f = _fitted(begun, recordings, LAST_ROUNDS, LAST_STEPS, deadline)
@@ -264,30 +262,28 @@ class _TermSearch:
     def with_every_term(self, model: Model) -> tuple[Fitted | None, Fitted]:
         """The best fit with every term, None if there is no time for it; and the best one without any.
 
-        Fits start from each lag, with and without dry friction, over growing horizons.
+        Fits start from each lag, with and without dry friction, and hold every term from the shortest horizon on: for a
+        term that comes later the static curve already stands in.
         """
         coarse = [downsampled(s) for s in self.recordings]
         tests = [WeakForm(s) for s in coarse]
         kinds = (False, True) if "coulomb_friction" not in self.keep else (False,)
-        starts = likeliest(model, coarse, tests, kinds=kinds)
-        begun: list[Fitted] = []
-        for found in starts:
-            best = {s.lag: s.model for s in reversed(found)}
-            if best and not (begun and passed(self.deadline)):
-                begun.append(self._over_growing_horizons(list(best.values())))
-        plain = self._fitted(begun[0].model if starts[0] else model)
+        best = [list({s.lag: s.model for s in reversed(found)}.values())
+                for found in likeliest(model, coarse, tests, kinds=kinds)]
+        begun = self._over_growing_horizons(best[0]).model if best[0] else model
+        plain = self._fitted(begun)
         if passed(self.deadline):
             return None, plain
-        begun = [plain, *begun[1 if starts[0] else 0:]]
-        full = [self._completed(one.model) for one in begun]
-        most = min(parallel(self.jobs, self._fitted, full), key=lambda one: one.fit.mean_square)
+        grown = self._over_growing_horizons([self._completed(m) for m in itertools.chain([begun], *best)]).model
+        starts = [grown, self._completed(plain.model, NOTHING)]  # the second one does not end worse than without terms
+        most = min(parallel(self.jobs, self._fitted, starts), key=lambda one: one.fit.mean_square)
         return None if passed(self.deadline) else most, plain
 
-    def _completed(self, m: Model) -> Model:
-        """A model with the terms that it lacks, at the sizes from which a fit starts."""
+    def _completed(self, m: Model, size: float = FIRST_SIZE) -> Model:
+        """A model with the terms that it lacks, at a size in default sizes."""
         there = held(m)
         lacking = [n for n in CHOSEN if n not in there and key(n).owner not in self.keep]
-        return with_values(m, {n: absent_at(n) + FIRST_SIZE * _usual(n, m) for n in lacking})
+        return with_values(m, {n: absent_at(n) + size * _usual(n, m) for n in lacking})
 
     def _over_growing_horizons(self, models: Sequence[Model]) -> Fitted:
         """The best of some starts after fits over the beginning, then over more and more, while there is time."""
@@ -313,16 +309,6 @@ class _TermSearch:
                 return best
             best = simpler
         return None
-
-    def refined(self, model: Model, best: Fitted) -> Fitted:
-        """Search again with what refines a term, if it stayed: without it, the static curve had to stand in for it."""
-        owners = {key(name).owner for name in held(best.model) if refines(name)} - self.keep
-        if not owners:
-            return best
-        begun = model.with_effects({**model.effects, **{e: best.model.effects[e] for e in owners}})
-        full = self.with_every_term(begun)[0]
-        again = None if full is None else self.simplified(full)
-        return best if again is None or again.fit.evidence_over(best.fit) < 0.0 else again
 
     def delay_or_lag(self, best: Fitted) -> tuple[str, ...]:
         """A note if the recordings do not tell whether a transport delay or a second lag puts the lift off."""

@@ -16,8 +16,8 @@ from aeropend_ident.interrupt import check
 from aeropend_ident.signals.pulses import mean_speed
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import actuator, dynamics, sensing
-from aeropend_sim.model.coefficients import LONGEST_STEP, prepare
-from aeropend_sim.model.parameters import Model
+from aeropend_sim.model.coefficients import prepare
+from aeropend_sim.model.parameters import LONGEST_STEP, Model
 from aeropend_sim.model.state import State
 
 Array = NDArray[np.float64]

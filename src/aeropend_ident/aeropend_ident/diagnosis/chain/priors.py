@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from aeropend_ident.diagnosis.chain.chain import DELAY, CutChains
-from aeropend_ident.diagnosis.chain.values import FILTER, STAGES, absent_at, limits
+from aeropend_ident.diagnosis.chain.values import AT_REST, FILTER, STAGES, absent_at, at_rest, limits
 from aeropend_ident.diagnosis.policy import angle_only, free_swinging
 from aeropend_ident.estimation.parameter import Parameter, key, started
 from aeropend_ident.signals.signals import STILL, Signals
@@ -231,9 +231,8 @@ def _of_angle(model: Model, recordings: Sequence[Signals]) -> list[Parameter]:
     full = max(float(actuator.voltage(m, max(s.largest_duty for s in recordings))), LEAST_VOLTAGE)
     heaviest = HEAVIEST * (1.0 + HEAVIEST) * m["K_e"] ** 2 * m["K_t"] / (m["R_a"] * full)
     quickest = max(QUICKEST * slower, 0.6 * max(s.period for s in recordings)) * m["K_t"] * m["K_e"] / m["R_a"]
-    rest = -m["k1"] * math.sqrt(m["k3"])  # a duty of 0 does not turn the rotor
     reverse = [Parameter("reverse", m["reverse"], REVERSE_SD, 0.0, 1.0)] if m["reverse"] > 0.0 else []
-    return [*arm, *reverse, log("L_over_J", 0.7), Parameter("k0", min(m["k0"], rest), 0.5, -10.0, rest),
+    return [*arm, *reverse, log("L_over_J", 0.7), Parameter(AT_REST, min(at_rest(model), 0.0), 0.5, -10.0, 0.0),
             replace(log("k3", 1.5), high=STRAIGHT * m["k2"]), replace(log("k_load", 1.0), high=heaviest),
             replace(log("J_m", 0.7), low=quickest), _filter(model), *own]
 

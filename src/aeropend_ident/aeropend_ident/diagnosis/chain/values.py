@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -31,10 +32,16 @@ FILTER = "sensing.angle_filter_tau"
 CHANNELS_OF = {"actuator": ("v_a",), "motor": ("i_a", "omega"), "arm": ("theta",)}
 """The channels that each stage predicts."""
 
+AT_REST = "map.at_rest"
+"""[V] k0 + k1 sqrt(k3), the map's value at a duty of 0, which is fitted in place of k0 where only the angle is known.
+
+It is at most 0 if such a duty does not turn the rotor. A fit moves along a bound of a parameter, but not along one that
+two parameters share."""
+
 PLACE_OF_PARAMETER = {
     **dict.fromkeys(STAGES["actuator"], "actuator"), **dict.fromkeys(("R_a", "L_a", "K_e"), "electrical"),
     **dict.fromkeys(("K_t", "J_m", "B_m", "k_load"), "rotor"), "k_thrust": "thrust", "L_over_J": "thrust",
-    "mgd_over_J": "arm", "c_over_J": "arm", FILTER: "sensing",
+    "mgd_over_J": "arm", "c_over_J": "arm", FILTER: "sensing", AT_REST: "actuator",
 }
 """The place in the chain of each parameter of the model."""
 
@@ -60,9 +67,16 @@ def with_values(model: Model, values: Values) -> Model:
             numbers[name] = value
         elif k.owner == "sensing":
             measuring[k.name] = value
-        elif not k.is_initial:
+        elif name != AT_REST and not k.is_initial:
             effects.setdefault(k.owner, {})[k.name] = value
+    if AT_REST in values:
+        numbers["k0"] = values[AT_REST] - numbers["k1"] * math.sqrt(numbers["k3"])
     return Model(model.name, numbers, measuring, effects)
+
+
+def at_rest(model: Model) -> float:
+    """[V] `AT_REST` of a model."""
+    return model.model["k0"] + model.model["k1"] * math.sqrt(model.model["k3"])
 
 
 def without_effects(values: Values, model: Model) -> dict[str, float]:
@@ -78,6 +92,8 @@ def absent_at(name: str) -> float:
 def neutral(model: Model, name: str) -> float:
     """The value of a parameter in the nominal model; that of an effect which the model lacks is the one without it."""
     k = key(name)
+    if name == AT_REST:
+        return at_rest(model)
     if k.owner == "sensing":
         return model.sensing[k.name]
     return model.effect(k.owner, k.name) if k.owner else model.model[k.name]
@@ -94,6 +110,8 @@ def acts_on_motor(name: str) -> bool:
 def limits(name: str) -> EffectParameter | ModelParameter:
     """The limits of a parameter of the model, of the measurement chain or of an effect."""
     k = key(name)
+    if name == AT_REST:
+        return PARAMETERS["model.k0"]
     return DEFINED[k.owner].parameters[k.name] if k.owner in DEFINED else PARAMETERS[
         name if k.owner else f"model.{name}"]
 
