@@ -75,8 +75,8 @@ POWERS = {"s": 1, "1/s": -1, "rad/s": -1, "rad/s²": -2, "1/s²": -2}
 LEAST_VOLTAGE = 1e-3
 """[V] Voltage at the largest duty that a bound of the load is computed for at least (choice: far below any)."""
 
-STRAIGHT = 2.0
-"""Largest ratio k3/k2 (derived: the formula for the voltage is then straight to 3 % of its range)."""
+STRAIGHT = 30.0
+"""Largest ratio k3/k2 (derived: the formula for the voltage is then straight to k2/(16 k3), 0.2 % of its range)."""
 
 REFERENCE_GRAVITY = 33.8
 """[1/s²] `mgd_over_J` of the rig for which the catalogue's default sizes matter (convention: config/bench.yaml)."""
