@@ -13,8 +13,10 @@ from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.search.findings import adopted
 from aeropend_ident.diagnosis.search.hypotheses import hypotheses
-from aeropend_ident.estimation.map_fit import MAY_CHANGE, WEIGHT_CHANGE, Residuals, Search, fit
+from aeropend_ident.estimation.levenberg_marquardt import Search
+from aeropend_ident.estimation.map_fit import MAY_CHANGE, WEIGHT_CHANGE, fit
 from aeropend_ident.estimation.parameter import Parameter, started
+from aeropend_ident.estimation.residuals import Residuals
 from aeropend_ident.testing.rigs import BENCH, recorded
 from evaluation.benchmarks import measure
 from evaluation.benchmarks.measure import Figure, Spread, interleaved

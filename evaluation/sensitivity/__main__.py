@@ -35,7 +35,7 @@ PAGE = results.ROOT / "docs" / "results" / "thresholds.md"
 FIRST = ("policy.", "search.search.", "search.selection.", "search.hypotheses.", "search.unknown_effect.",
          "search.gust.", "search.speed_spikes.", "joint_fit.", "search.", "pwm_timing.", "priors.", "noise.", "pulses.",
          "outliers.", "free_decay.", "signals.signals.", "statistics.", "nominal_fit.", "chain.", "regions.",
-         "conclude.", "map_fit.", "from_bag.", "grid.")
+         "conclude.", "estimation.", "from_bag.", "grid.")
 """Parts of names of thresholds, in the order in which they are measured; the rest comes last."""
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
 from aeropend_ident.diagnosis.chain.nominal_fit import _possible
 from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.chain.values import STAGES
-from aeropend_ident.estimation.map_fit import Search
+from aeropend_ident.estimation.levenberg_marquardt import Search
 from aeropend_ident.testing.rigs import BENCH, recorded
 from aeropend_sim.model import actuator
 from aeropend_sim.model.parameters import SAMPLE_PERIOD

@@ -14,8 +14,8 @@ from aeropend_ident.diagnosis.diagnosis import Diagnosis, diagnose
 from aeropend_ident.diagnosis.document import DocumentError
 from aeropend_ident.diagnosis.report import changes
 from aeropend_ident.diagnosis.results import Results, document
-from aeropend_ident.estimation.map_fit import fit, prior_information
-from aeropend_ident.estimation.parameter import Parameter
+from aeropend_ident.estimation.map_fit import fit
+from aeropend_ident.estimation.parameter import Parameter, prior_information
 from aeropend_ident.signals.signals import Signals, from_arrays
 from aeropend_ident.testing import bags
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps

@@ -56,7 +56,7 @@ from aeropend_ident.diagnosis.search import gust, onset, speed_spikes, unknown_e
 from aeropend_ident.diagnosis.search.findings import Findings
 from aeropend_ident.diagnosis.search.learned_term import learn
 from aeropend_ident.diagnosis.search.search import refit, search, trifling_gap, unsearched
-from aeropend_ident.estimation.map_fit import passed
+from aeropend_ident.estimation.deadline import passed
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import effect_file

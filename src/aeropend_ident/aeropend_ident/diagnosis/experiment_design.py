@@ -20,9 +20,10 @@ from aeropend_ident.diagnosis.chain.free_run import StagedRun
 from aeropend_ident.diagnosis.chain.priors import NOMINAL_SD
 from aeropend_ident.diagnosis.chain.values import clipped
 from aeropend_ident.diagnosis.document import NextExperiment
-from aeropend_ident.estimation.map_fit import DAMPING, DAMPING_DOWN, finite
+from aeropend_ident.estimation.levenberg_marquardt import DAMPING, DAMPING_DOWN
 from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import key
+from aeropend_ident.estimation.residuals import finite
 from aeropend_ident.signals.signals import CHANNELS, Signals
 from aeropend_sim.model.effects import DEFINED, PARAMETER_MISMATCH
 from aeropend_sim.model.excitation import Excitation

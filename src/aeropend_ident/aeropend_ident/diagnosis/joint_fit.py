@@ -22,9 +22,11 @@ from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
 from aeropend_ident.diagnosis.search.search import refit
 from aeropend_ident.diagnosis.search.selection import noise_over_spread
-from aeropend_ident.estimation.map_fit import Fit, Sensitivities, fit, fit_again, sensitivities, within_bounds
+from aeropend_ident.estimation.bounded_fit import sensitivities, within_bounds
+from aeropend_ident.estimation.map_fit import Fit, fit, fit_again
 from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter, key, started
+from aeropend_ident.estimation.residuals import Sensitivities
 from aeropend_ident.signals.statistics import Z95, rms
 from aeropend_sim.model.parameters import Model
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct
 
-from aeropend_ident.estimation.map_fit import band_log_likelihood, bands
+from aeropend_ident.estimation.whittle import band_log_likelihood, bands
 from aeropend_sim.compiled import njit
 
 Array = NDArray[np.float64]

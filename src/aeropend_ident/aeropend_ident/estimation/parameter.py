@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
 
 
 class Key(NamedTuple):
@@ -100,3 +103,17 @@ class Parameter:
 def started(parameters: Iterable[Parameter], values: Mapping[str, float]) -> list[Parameter]:
     """The parameters with these values as starts; others keep their start."""
     return [replace(p, start=values.get(p.name, p.start)) for p in parameters]
+
+
+def prior_information(parameters: Sequence[Parameter]) -> Array:
+    """Information matrix (P, P) of the prior in standard units: the inverse of the correlations.
+
+    Two parameters are correlated if both state it: one that replaces another is not.
+    """
+    at = {p.name: j for j, p in enumerate(parameters)}
+    stated = {(at[p.name], at[other]): value for p in parameters for other, value in p.correlation if other in at}
+    correlations = np.eye(len(parameters))
+    for (j, k), value in stated.items():
+        if k < j and (k, j) in stated:
+            correlations[j, k] = correlations[k, j] = value
+    return np.asarray(np.linalg.inv(correlations))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.blas import dsyrk
 
-from aeropend_ident.estimation.map_fit import finite
+from aeropend_ident.estimation.residuals import finite
 from aeropend_ident.identification.free_run import RightHandSide, Wanted, run, sensitivities
 from aeropend_ident.identification.terms import Array, Indices, Library
 from aeropend_ident.signals.statistics import effective_sample_size

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from aeropend_ident.diagnosis.chain.known import Known
 from aeropend_ident.diagnosis.chain.values import STAGES, Values, with_values, without_effects
 from aeropend_ident.diagnosis.policy import CALIBRATED, Policy
-from aeropend_ident.estimation.map_fit import finite
 from aeropend_ident.estimation.parameter import key
+from aeropend_ident.estimation.residuals import finite
 from aeropend_ident.interrupt import check
 from aeropend_ident.signals.pulses import mean_speed
 from aeropend_ident.signals.signals import Signals, split_apply

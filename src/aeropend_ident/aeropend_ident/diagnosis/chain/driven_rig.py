@@ -35,7 +35,8 @@ from aeropend_ident.diagnosis.chain.values import FILTER, absent_at, of_rig, sta
 from aeropend_ident.diagnosis.chain.weak_start import WeakForm, downsampled, likeliest
 from aeropend_ident.diagnosis.document import Lift
 from aeropend_ident.diagnosis.policy import UNCALIBRATED
-from aeropend_ident.estimation.map_fit import POORER, Fit, fit, passed
+from aeropend_ident.estimation.deadline import passed
+from aeropend_ident.estimation.map_fit import POORER, Fit, fit
 from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals

@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.chain.values import STAGES
-from aeropend_ident.estimation.map_fit import WEIGHT_CHANGE, Fit, covariance_of, sensitivities, weights
+from aeropend_ident.estimation.bounded_fit import sensitivities
+from aeropend_ident.estimation.map_fit import WEIGHT_CHANGE, Fit, covariance_of
 from aeropend_ident.estimation.parameter import Parameter, key
+from aeropend_ident.estimation.residuals import weights
 
 Array = NDArray[np.float64]
 Residuals = dict[str, Array]

@@ -20,8 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
-from aeropend_ident.estimation.map_fit import Fit, Search, finite
+from aeropend_ident.estimation.levenberg_marquardt import Search
+from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter, key, started
+from aeropend_ident.estimation.residuals import finite
 from aeropend_ident.signals.pulses import mean_speed
 from aeropend_ident.signals.smoothing import lag
 from aeropend_ident.signals.statistics import effective_sample_size

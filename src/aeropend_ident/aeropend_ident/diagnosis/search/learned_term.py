@@ -23,9 +23,11 @@ from aeropend_ident.diagnosis.policy import GOOD_ENOUGH
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis
 from aeropend_ident.diagnosis.search.free_curves import FOLDS, MOST_SAMPLES, knots_of
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
-from aeropend_ident.estimation.map_fit import Fit, Search, finite, fit, largest_ess
+from aeropend_ident.estimation.levenberg_marquardt import Search
+from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess
 from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter, key, started
+from aeropend_ident.estimation.residuals import finite
 from aeropend_sim.model import actuator, effect_file
 from aeropend_sim.model.terms import along
 

@@ -25,7 +25,8 @@ from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import EFFECT_ODDS, Hypothesis, hypotheses, stages_of
 from aeropend_ident.diagnosis.search.search import passes_as_noise
 from aeropend_ident.diagnosis.search.selection import CLOSE_GAIN, FORM_SHOWS, squared_gap
-from aeropend_ident.estimation.map_fit import Fit, Search, fit
+from aeropend_ident.estimation.levenberg_marquardt import Search
+from aeropend_ident.estimation.map_fit import Fit, fit
 from aeropend_ident.estimation.parameter import Parameter, key, started
 
 Array = NDArray[np.float64]

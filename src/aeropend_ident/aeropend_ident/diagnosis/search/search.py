@@ -40,7 +40,8 @@ from aeropend_ident.diagnosis.search.selection import (
     squared_gap,
 )
 from aeropend_ident.diagnosis.search.sets import compared, with_best_set
-from aeropend_ident.estimation.map_fit import Fit, fit, fit_again, largest_ess, passed
+from aeropend_ident.estimation.deadline import passed
+from aeropend_ident.estimation.map_fit import Fit, fit, fit_again, largest_ess
 from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter, started
 

@@ -31,9 +31,13 @@ from aeropend_ident.diagnosis.search.hypotheses import (
     linear_parameters,
     other_forms,
 )
-from aeropend_ident.estimation.map_fit import Fit, finite, fit, largest_ess, passed, screen, whittle
+from aeropend_ident.estimation.deadline import passed
+from aeropend_ident.estimation.map_fit import Fit, fit, largest_ess
 from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter, key, started
+from aeropend_ident.estimation.residuals import finite
+from aeropend_ident.estimation.screening import screen
+from aeropend_ident.estimation.whittle import whittle
 from aeropend_ident.signals.signals import CHANNELS
 from aeropend_ident.signals.statistics import effective_sample_size
 from aeropend_sim.model.effects import DEFINED

@@ -24,10 +24,12 @@ from aeropend_ident.diagnosis.policy import CALIBRATED
 from aeropend_ident.diagnosis.search.findings import Findings, LikelySet, RankedHypothesis, Selection, adopted
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, from_linear, linear_parameters
 from aeropend_ident.diagnosis.search.selection import ALIKE, CONTENDERS, ROUNDS, squared_gap
+from aeropend_ident.estimation.bounded_fit import sensitivities
 from aeropend_ident.estimation.linear_sets import LinearSets
-from aeropend_ident.estimation.map_fit import Fit, finite, fit, prior_information, sensitivities, with_posterior_slopes
+from aeropend_ident.estimation.map_fit import Fit, fit, with_posterior_slopes
 from aeropend_ident.estimation.parallel import parallel
-from aeropend_ident.estimation.parameter import Parameter, started
+from aeropend_ident.estimation.parameter import Parameter, prior_information, started
+from aeropend_ident.estimation.residuals import finite
 from aeropend_sim.model.effects import DEFINED
 
 Array = NDArray[np.float64]
