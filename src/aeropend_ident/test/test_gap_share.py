@@ -89,8 +89,8 @@ class Fitted:
         return {p.name: p for p in gap_share.parts_of_effects(self, self, self.gap_of(self.before), 0.03)}
 
 
-def effect(name):
-    return SimpleNamespace(name=name, place="arm", own=[SimpleNamespace(name=f"{name}.size")])
+def effect(name, parameter=""):
+    return SimpleNamespace(name=name, place="arm", parameter=parameter, own=[SimpleNamespace(name=f"{name}.size")])
 
 
 def test_one_of_two_effects_that_stand_in_for_each_other_is_unique():
@@ -98,9 +98,20 @@ def test_one_of_two_effects_that_stand_in_for_each_other_is_unique():
     fixed = {"": 0.1, "a": 0.5, "b": 0.7, "c": 0.2, "bc": 0.9, "ac": 0.6, "ab": 0.8, "abc": 1.0}
     parts = Fitted([[a, b, c]], fixed, {"a": 0.11, "b": 0.12, "c": 0.2, "ab": 0.6}).parts()
     assert [parts[n].unique for n in "abc"] == pytest.approx([0.01, 0.49, 0.1])
+    assert [parts[n].instead_of for n in "abc"] == ["b", "", ""]
     head = headline(list(parts.values()), shares(list(parts.values())), 0.03)
     assert set(head.effects) == {"b", "c"}
     assert head.small == ["a"]
+
+
+def test_a_parameter_that_is_off_stands_in_for_an_effect_and_not_the_effect_for_it():
+    fixed = {"": 0.1, "a": 0.5, "b": 0.7, "ab": 1.0}
+    parts = Fitted([[effect("a"), effect("b", "k0")]], fixed, {"a": 0.11, "b": 0.12}).parts()
+    assert [parts[n].unique for n in "ab"] == pytest.approx([0.88, 0.02])
+    assert parts["b"].instead_of == "a"
+    assert [parts[n].ends[1] for n in "ab"] == pytest.approx([0.9, 0.9])
+    head = headline(list(parts.values()), shares(list(parts.values())), 0.03)
+    assert (head.effects, head.small) == (["a"], ["b"])
 
 
 def test_effects_that_cancel_each_other_have_the_parts_of_others_fitted_again():

@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which pairs of effects the verdict calls not separable."""
 
+import numpy as np
+
 from aeropend_ident.diagnosis.chain.chain import CutChains
-from aeropend_ident.diagnosis.conclude import not_separable
+from aeropend_ident.diagnosis.conclude import not_separable, stand_ins
+from aeropend_ident.diagnosis.gap_share import Part
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis
 from aeropend_ident.diagnosis.search.hypotheses import hypotheses
 from aeropend_ident.diagnosis.search.search import refit, unsearched
+from aeropend_ident.estimation.map_fit import estimate
 from aeropend_ident.testing.rigs import BENCH, recorded
 
 
@@ -27,3 +31,12 @@ def test_a_rival_is_compared_beside_the_other_effects_of_its_stage():
     pairs = not_separable(chains, {"arm": Findings("arm", base, final, found)})
     assert [(first.hypothesis.effect, rival.hypothesis.effect) for first, rival in pairs] == [
         ("thrust_lag", "encoder_lag")]
+
+
+def test_an_effect_found_that_stands_in_for_another_is_not_separable_from_it():
+    of = {h.effect: h for h in hypotheses(BENCH) if not h.parameter}
+    fit = estimate({}, {})
+    drop, sag = (RankedHypothesis(of[e], fit, 100.0, 1.0) for e in ("bridge_drop", "supply_sag"))
+    parts = [Part("bridge_drop", "actuator", 1.0, np.ones(3)),
+             Part("supply_sag", "actuator", 0.5, np.ones(3), instead_of="bridge_drop")]
+    assert stand_ins(parts, {"actuator": Findings("actuator", fit, fit, ((drop,), (sag,)))}) == [(drop, sag)]

@@ -95,7 +95,7 @@ def conclusions(now: Measured, settings: Settings) -> Conclusions:
     reasons = [f"{c} is off by {times(x)} a reading's noise" for c, x in left.items() if x > GOOD_ENOUGH]
     reasons = [failed] if failed else reasons
     drawn = None if unknown is None else _drawn(unknown.term, now, settings)
-    undecided = not_separable(chains, stages)
+    undecided = [*not_separable(chains, stages), *stand_ins(parts, stages)]
     tried = EXPERIMENTS if calibrated else experiments_within(max(s.largest_duty for s in found.recordings))
     rows = parameter_rows(chains, joint)
     closed, low, high = closure(gaps.before, gaps.after, gaps.floors)
@@ -331,6 +331,18 @@ def not_separable(chains: CutChains, findings: Mapping[str, Findings]
                       if r.probability > chains.policy.undecided or r.hypothesis.name in alike]
             before = first.fit
     return pairs
+
+
+def stand_ins(parts: Sequence[gap_share.Part], findings: Mapping[str, Findings]
+              ) -> list[tuple[RankedHypothesis, RankedHypothesis]]:
+    """Pairs of effects found of which either closes what both do: the one that is claimed, and the other.
+
+    Args:
+        parts: of the gap.
+        findings: stage -> what is claimed.
+    """
+    found = {s[0].hypothesis.name: s[0] for f in findings.values() for s in f.found}
+    return [(found[p.instead_of], found[p.name]) for p in parts if p.instead_of]
 
 
 def _closing_as_much(chains: CutChains, findings: Findings, before: Fit, first: RankedHypothesis,

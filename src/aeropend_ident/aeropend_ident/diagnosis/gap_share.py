@@ -59,6 +59,7 @@ class Part:
         unsure: relative standard deviation of the size of the effect, its other parameters held.
         ends: least and most that it may be, as effects stand in for each other.
         unique: what comes back without it although the other effects are fitted again: no other effect closes that.
+        instead_of: name of an effect that it stands in for: either of the two closes what both do; "": of none.
     """
 
     name: str
@@ -68,6 +69,7 @@ class Part:
     unsure: float = 0.0
     ends: tuple[float, float] = (math.inf, -math.inf)
     unique: float = math.inf
+    instead_of: str = ""
 
 
 @dataclass(frozen=True)
@@ -154,8 +156,9 @@ def _without_stand_ins(parts: Sequence[Part], effects: Mapping[str, Hypothesis],
                        least: float, jobs: int) -> list[Part]:
     """What is unique to each part once effects that stand in for others are left out.
 
-    Of two effects that stand in for each other neither is unique. The one without which the smaller gap is left is
-    left out, and the other is judged anew.
+    Of two effects that stand in for each other neither is unique. A parameter that is off is left out before an effect,
+    which is likelier; else the one without which the smaller gap is left. The other is judged anew. Either closes what
+    both do, so either may have the part of both.
 
     Args:
         parts: of the effects.
@@ -170,13 +173,20 @@ def _without_stand_ins(parts: Sequence[Part], effects: Mapping[str, Hypothesis],
         open_ = [p for p in judged.values() if p.amount >= least > p.unique and effects[p.name] not in left_out]
         if len(open_) < 2:
             return list(judged.values())
-        left_out.append(effects[min(open_, key=lambda p: p.unique).name])
-        gone = {p.name: [*left_out, effects[p.name]] for p in open_ if effects[p.name] not in left_out}
+        out = min(open_, key=lambda p: (not effects[p.name].parameter, p.unique)).name
+        left_out.append(effects[out])
+        gone = {p.name: [*left_out, effects[p.name]] for p in open_ if p.name != out}
         joint.fit_without([(left_out, True), *((each, True) for each in gone.values())], jobs)
         without = squared(held_out.gap_of(joint.without(left_out, others=True)))
         for name, each in gone.items():
             one = held_out.gap_of(joint.without(each, others=True))
             judged[name] = replace(judged[name], unique=squared(one) - without)
+        other = max(gone, key=lambda name: judged[name].unique)
+        if judged[other].unique >= least:
+            both = judged[out].amount + judged[other].amount
+            judged |= {name: replace(p, ends=(min(p.ends[0], both), max(p.ends[1], both)))
+                       for name, p in judged.items() if name in (out, other)}
+            judged[out] = replace(judged[out], instead_of=other)
 
 
 def _names(effects: Sequence[Hypothesis]) -> frozenset[str]:

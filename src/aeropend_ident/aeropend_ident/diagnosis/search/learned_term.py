@@ -215,7 +215,10 @@ def learn(chains: CutChains, findings: Findings, place: str, jobs: int) -> Learn
         The term; None if no curve predicts blocks of time that it was not fitted to.
     """
     system = _System.of(chains, findings, (), jobs)
-    first = [_fitted(chains, findings, (system.curves[j],), values) for j, values in system.first()]
+    begun = [((system.curves[j],), values) for j, values in system.first()]
+    for curves, _ in begun:
+        defined(curves)  # here, so that it is known beyond the copies of this process that fit
+    first = parallel(jobs, lambda one: _fitted(chains, findings, *one), begun)
     if not first:
         return None
     ess = largest_ess(one.fit for one in first)
