@@ -40,3 +40,11 @@ def test_an_effect_found_that_stands_in_for_another_is_not_separable_from_it():
     parts = [Part("bridge_drop", "actuator", 1.0, np.ones(3)),
              Part("supply_sag", "actuator", 0.5, np.ones(3), instead_of="bridge_drop")]
     assert stand_ins(parts, {"actuator": Findings("actuator", fit, fit, ((drop,), (sag,)))}) == [(drop, sag)]
+
+
+def test_an_effect_that_was_taken_out_counts_as_tried():
+    flex = next(h for h in hypotheses(BENCH) if h.effect == "mast_flex")
+    one, other = ((RankedHypothesis(flex, estimate({"x": 1.0, "y": 2.0}, {}), 9.0, 0.9),) for _ in range(2))
+    f = Findings("arm", one[0].fit, one[0].fit, (one,), cut_short=True).without(one)
+    assert [(r.hypothesis, r.probability) for r in f.rivals] == [(flex, 0.0)]
+    assert other not in (one,)  # two selections of one effect are told apart

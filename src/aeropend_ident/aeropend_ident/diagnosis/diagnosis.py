@@ -281,10 +281,9 @@ def _without(found: Found, name: str) -> Found:
     """The findings without an effect; what is left without it decides again whether it is random, or unknown."""
     stages = dict(found.stages)
     for stage, f in found.stages.items():
-        kept = tuple(s for s in f.found if s[0].hypothesis.name != name)
-        if len(kept) < len(f.found):
-            final = refit(found.chains, stage, [s[0].hypothesis for s in kept], f.final.values, f.base)
-            stages[stage] = replace(f, found=kept, final=final)
+        for selection in (s for s in f.found if s[0].hypothesis.name == name):
+            kept = [h for h in f.effects if h.name != name]
+            stages[stage] = f.without(selection, refit(found.chains, stage, kept, f.final.values, f.base))
     detected = gust.detect(found.chains, stages["arm"])
     stages["arm"] = detected.arm
     return _judged(replace(found, stages=stages, statistical=replace(found.statistical, gust=detected.gust)))

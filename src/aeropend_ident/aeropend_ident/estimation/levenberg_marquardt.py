@@ -215,8 +215,7 @@ class Search:
         r = self.stack(residuals)
         return _Trial(z, residuals, float(r @ r + z @ self.prior @ z))
 
-    def improve(self, steps: int, deadline: float | None = None, *, first_look: bool = False
-                ) -> tuple[Array, Products]:
+    def improve(self, steps: int, deadline: float | None = None, *, first_look: bool = False) -> Products:
         """Take Levenberg-Marquardt steps with the weights as they are.
 
         Args:
@@ -225,10 +224,9 @@ class Search:
             first_look: see `fit`.
 
         Returns:
-            Information matrix and products of the last `normal_equations`.
+            Products of the last `normal_equations`.
         """
-        damping = DAMPING
-        information, products = self.prior, Products()
+        damping, products = DAMPING, Products()
         for done in range(steps):
             if done and passed(deadline):
                 break
@@ -265,4 +263,4 @@ class Search:
             self.fresh = False
             if ended or not straight:
                 self.slopes = {}
-        return information, products
+        return products

@@ -48,9 +48,9 @@ POORER = 1.05
 """Ratio of mean squares above which a fit has ended in a worse local minimum than another (choice: 2.5 % in RMS)."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
-    """A fitted hypothesis.
+    """A fitted hypothesis; equal to itself alone.
 
     Attributes:
         values: name -> estimate.
@@ -147,32 +147,33 @@ def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence
         rounds: how often the weights are renewed at most.
         steps: Levenberg-Marquardt steps in each round.
         least_ess: effective sample size that a channel counts for at least during the search. A slow drift has a small
-            one; with wide priors the search would then stay near their means.
+            one; with wide priors the search would then stay near their means. Standard deviations count the true one.
         deadline: after it, the fit ends with its next step; see `passed`.
         first_look: the fit may end with derivatives that are corrected, where others would gain more. It is good enough
             to choose what is fitted on.
     """
     search = Search(residuals, parameters, least_ess)
-    information, products = search.prior, Products()
+    products = Products()
     for done in range(rounds):
         if done and passed(deadline):
             break
-        information, products = search.improve(steps, deadline, first_look=first_look)
+        products = search.improve(steps, deadline, first_look=first_look)
         before, ended = search.weight, search.ended
         search.renew_weights()
         changed = sum(abs(search.weight[k] - before[k]) >= WEIGHT_CHANGE * before[k] for k in before)
         if ended and changed <= MAY_CHANGE * len(before):
             break
-    z, covariance = search.z, covariance_of(information)
-    values = {p.name: p.value(x) for p, x in zip(parameters, z, strict=True)}
-    sd = {p.name: abs(p.slope(x)) * float(np.sqrt(v)) for p, x, v in zip(parameters, z, np.diag(covariance),
-                                                                         strict=True)}
+    z = search.z
     log_prior = 0.5 * float(np.linalg.slogdet(search.prior)[1] - z @ search.prior @ z)
-    return Fit(values, sd, search.current, search.scale, search.ess, log_prior, products, search.prior)
+    f = Fit({p.name: p.value(x) for p, x in zip(parameters, z, strict=True)}, {}, search.current, search.scale,
+            search.ess, log_prior, products, search.prior)
+    variance = np.diag(covariance_of(f.information(f.ess)))
+    return replace(f, sd={p.name: abs(p.slope(x)) * math.sqrt(v)
+                          for p, x, v in zip(parameters, z, variance, strict=True)})
 
 
 def fit_again(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter],
-              start: Mapping[str, float], base: Fit | None = None) -> Fit:
+              start: Mapping[str, float], base: Fit | None = None, least_ess: float = 0.0) -> Fit:
     """Fit from given values, and also from those of a fit with fewer parameters if it ends worse than that one.
 
     What is gone may have led the values into a local minimum.
@@ -182,11 +183,13 @@ def fit_again(residuals: Callable[[dict[str, float]], Residuals], parameters: Se
         parameters: as in `fit`.
         start: values to start from.
         base: the fit with fewer parameters; None: it is not asked.
+        least_ess: as in `fit`.
     """
-    f = fit(residuals, started(parameters, start))
+    f = fit(residuals, started(parameters, start), least_ess=least_ess)
     if base is None or not f.residuals or f.mean_square <= POORER * base.mean_square:
         return f
-    return min(f, fit(residuals, started(parameters, {**start, **base.values})), key=lambda one: one.mean_square)
+    again = fit(residuals, started(parameters, {**start, **base.values}), least_ess=least_ess)
+    return min(f, again, key=lambda one: one.mean_square)
 
 
 def with_posterior_slopes(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter], f: Fit

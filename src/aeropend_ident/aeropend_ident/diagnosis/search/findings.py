@@ -81,14 +81,24 @@ class Findings:
         return [*self.found, self.rivals]
 
     def without(self, selection: Selection, final: Fit | None = None) -> Findings:
-        """The findings without one of the effects; `final`: the fit of the others."""
-        return replace(self, found=tuple(s for s in self.found if s is not selection), final=final or self.final,
-                       sets=())
+        """The findings without one of the effects; the last one stays as what was tried.
+
+        Args:
+            selection: of the effect.
+            final: the fit of the others.
+        """
+        found = tuple(s for s in self.found if s is not selection)
+        return replace(self, found=found, rivals=self.rivals or (() if found else _ruled_out(selection)),
+                       final=final or self.final, sets=())
 
     def nothing(self) -> Findings:
         """The findings with all effects taken back; those of the first round stay as what was tried."""
-        tried = tuple(replace(r, probability=0.0) for r in (self.found[0] if self.found else self.rivals))
+        tried = _ruled_out(self.found[0] if self.found else self.rivals)
         return replace(self, found=(), rivals=tried, final=self.base, sets=())
+
+
+def _ruled_out(selection: Selection) -> Selection:
+    return tuple(replace(r, probability=0.0) for r in selection)
 
 
 def adopted(known: list[Parameter], hypothesis: Hypothesis, start: int = 0) -> list[Parameter]:
