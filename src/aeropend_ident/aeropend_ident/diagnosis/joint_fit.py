@@ -297,9 +297,8 @@ def _fitted(chains: CutChains, findings: Mapping[str, Findings]
     start: dict[str, float] = {}
     for f in findings.values():
         start.update(f.final.values)
-    base, least_ess = (findings["arm"].base, chains.policy.least_ess) if chains.policy.wide_search else (None, 0.0)
-    joint = fit_again(chains.joined(_free_run_residuals), list(_parameters(chains, findings).values()), start, base,
-                      least_ess)
+    base = findings["arm"].base if chains.policy.wide_search else None
+    joint = fit_again(chains.joined(_free_run_residuals), list(_parameters(chains, findings).values()), start, base)
     alone = _of_each_alone(chains, findings, joint)
     sd = {name: WIDER * s for name, s in joint.sd.items()}
     sd |= {name: max(sd[name], pooled_sd(estimates)) for name, estimates in alone.items()}

@@ -19,7 +19,7 @@ from aeropend_ident.diagnosis.free_run_gap import Gap, HeldOut
 from aeropend_ident.diagnosis.gap_budget import Repeats, budget
 from aeropend_ident.diagnosis.gap_share import Part
 from aeropend_ident.diagnosis.joint_fit import JointFit, fit_jointly
-from aeropend_ident.diagnosis.policy import MATERIAL_SHARE
+from aeropend_ident.diagnosis.policy import MATERIAL_SHARE, angle_only
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis
 from aeropend_ident.diagnosis.search.free_curves import Repeatable
 from aeropend_ident.diagnosis.search.learned_term import Learned
@@ -192,6 +192,8 @@ def _measure(fitted: CutChains, found: Found, joint: JointFit) -> Gaps:
     if not chains.policy.driven:  # what was selected on the whole decay is fitted again to its training part
         base = refit(fitted, "arm", [], base).values
         values = refit(fitted, "arm", found.stages["arm"].effects, values).values
+    elif chains.policy.wide_search and angle_only(chains.recordings):  # a search counts slow misfits for more
+        base = refit(chains, "arm", [], base).values
     held_out = HeldOut(chains, model, found.recordings, spikes=found.statistical.spikes is not None)
     before, after = held_out.runs(base), held_out.runs(values)
     return Gaps(held_out, base, before, after, held_out.gap(before, known=False), held_out.gap(after),

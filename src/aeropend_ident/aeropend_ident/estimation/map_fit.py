@@ -173,7 +173,7 @@ def fit(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence
 
 
 def fit_again(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter],
-              start: Mapping[str, float], base: Fit | None = None, least_ess: float = 0.0) -> Fit:
+              start: Mapping[str, float], base: Fit | None = None) -> Fit:
     """Fit from given values, and also from those of a fit with fewer parameters if it ends worse than that one.
 
     What is gone may have led the values into a local minimum.
@@ -183,13 +183,11 @@ def fit_again(residuals: Callable[[dict[str, float]], Residuals], parameters: Se
         parameters: as in `fit`.
         start: values to start from.
         base: the fit with fewer parameters; None: it is not asked.
-        least_ess: as in `fit`.
     """
-    f = fit(residuals, started(parameters, start), least_ess=least_ess)
+    f = fit(residuals, started(parameters, start))
     if base is None or not f.residuals or f.mean_square <= POORER * base.mean_square:
         return f
-    again = fit(residuals, started(parameters, {**start, **base.values}), least_ess=least_ess)
-    return min(f, again, key=lambda one: one.mean_square)
+    return min(f, fit(residuals, started(parameters, {**start, **base.values})), key=lambda one: one.mean_square)
 
 
 def with_posterior_slopes(residuals: Callable[[dict[str, float]], Residuals], parameters: Sequence[Parameter], f: Fit
