@@ -55,7 +55,7 @@ from aeropend_ident.diagnosis.policy import MATERIAL_SHARE, angle_only, policy_o
 from aeropend_ident.diagnosis.search import gust, onset, speed_spikes, unknown_effect
 from aeropend_ident.diagnosis.search.findings import Findings
 from aeropend_ident.diagnosis.search.learned_term import learn
-from aeropend_ident.diagnosis.search.search import refit, search, trifling_gap, unsearched
+from aeropend_ident.diagnosis.search.search import search, taken_out, trifling_gap, unsearched
 from aeropend_ident.estimation.deadline import passed
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals
@@ -282,8 +282,7 @@ def _without(found: Found, name: str) -> Found:
     stages = dict(found.stages)
     for stage, f in found.stages.items():
         for selection in (s for s in f.found if s[0].hypothesis.name == name):
-            kept = [h for h in f.effects if h.name != name]
-            stages[stage] = f.without(selection, refit(found.chains, stage, kept, f.final.values, f.base))
+            stages[stage] = taken_out(found.chains, f, selection)
     detected = gust.detect(found.chains, stages["arm"])
     stages["arm"] = detected.arm
     return _judged(replace(found, stages=stages, statistical=replace(found.statistical, gust=detected.gust)))

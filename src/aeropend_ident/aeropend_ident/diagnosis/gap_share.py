@@ -184,8 +184,9 @@ def _without_stand_ins(parts: Sequence[Part], effects: Mapping[str, Hypothesis],
         other = max(gone, key=lambda name: judged[name].unique)
         if judged[other].unique >= least:
             both = judged[out].amount + judged[other].amount
-            judged |= {name: replace(p, ends=(min(p.ends[0], both), max(p.ends[1], both)))
-                       for name, p in judged.items() if name in (out, other)}
+            for name in (out, other):
+                low, high = judged[name].ends
+                judged[name] = replace(judged[name], ends=(min(low, both), max(high, both)))
             judged[out] = replace(judged[out], instead_of=other)
 
 

@@ -20,7 +20,7 @@ from aeropend_ident.diagnosis.policy import CERTAIN
 from aeropend_ident.diagnosis.search.findings import Findings, Selection
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
-from aeropend_ident.diagnosis.search.search import refit
+from aeropend_ident.diagnosis.search.search import taken_out
 from aeropend_ident.diagnosis.search.selection import noise_over_spread
 from aeropend_ident.estimation.bounded_fit import sensitivities, within_bounds
 from aeropend_ident.estimation.map_fit import Fit, fit, fit_again
@@ -284,8 +284,7 @@ def fit_jointly(chains: CutChains, findings: Mapping[str, Findings], *, gust: bo
 
     while not chains.policy.calibrated and (weak := _least_needed(chains.model, found, values, widened())):
         stage, selection = weak
-        f = found[stage].without(selection)
-        found[stage] = replace(f, final=refit(chains, stage, f.effects, f.final.values, f.base))
+        found[stage] = taken_out(chains, found[stage], selection)
         joint, values, sd, alone = _fitted(chains, found)
         checks = _checks(chains, found)
     return JointFit(chains, found, joint, values, widened(), checks, alone)

@@ -22,7 +22,7 @@ from aeropend_ident.diagnosis.chain.priors import TOLERANCE, usual_size
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF
 from aeropend_ident.diagnosis.gap_share import headline, shares
 from aeropend_ident.diagnosis.isolation.free_runs import FreeRuns
-from aeropend_ident.diagnosis.isolation.linear import Column, LinearStages, Residuals, Screening
+from aeropend_ident.diagnosis.isolation.linear import Column, LinearStages, Screening
 from aeropend_ident.diagnosis.isolation.planned import SEED
 from aeropend_ident.diagnosis.joint_fit import SURE, WIDER
 from aeropend_ident.diagnosis.policy import CALIBRATED, CERTAIN, MATERIAL, MATERIAL_SHARE
@@ -30,6 +30,7 @@ from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, stages_of
 from aeropend_ident.diagnosis.search.selection import squared_gap
 from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter
+from aeropend_ident.estimation.residuals import Residuals
 from aeropend_sim.model.effects import DEFINED, RANDOM
 
 Array = NDArray[np.float64]

@@ -22,11 +22,9 @@ from aeropend_ident.diagnosis.chain.values import STAGES
 from aeropend_ident.estimation.bounded_fit import sensitivities
 from aeropend_ident.estimation.map_fit import WEIGHT_CHANGE, Fit, covariance_of
 from aeropend_ident.estimation.parameter import Parameter, key
-from aeropend_ident.estimation.residuals import weights
+from aeropend_ident.estimation.residuals import Residuals, weights
 
 Array = NDArray[np.float64]
-Residuals = dict[str, Array]
-"""Channel -> (N,) in units of a reading's noise."""
 
 ROUNDS = 4
 """Rounds in which the weights of a linear fit are renewed at most (choice: they hardly change after the second)."""
@@ -72,7 +70,7 @@ class LinearStages:
     def __init__(self, chains: CutChains, stages: Sequence[str] = tuple(STAGES)) -> None:
         self.chains = chains
         self.parameters: list[Parameter] = []
-        self.noise: Residuals = {}
+        self.noise: dict[str, Array] = {}
         self.stage_of: dict[str, str] = {}
         self._columns: list[Column] = []
         for stage in stages:
@@ -96,7 +94,7 @@ class LinearStages:
 
     def change(self, values: Mapping[str, float], stages: Sequence[str]) -> Residuals:
         """Channel -> (N,) change of the residuals by some values, in some stages; unchanged channels are left out."""
-        out: Residuals = {}
+        out: dict[str, Array] = {}
         for stage in stages:
             own = {p.name: p.mean for p in nominal_parameters(self.chains, stage)}
             before = {c: x for c, x in self.noise.items() if self.stage_of[c] == stage}

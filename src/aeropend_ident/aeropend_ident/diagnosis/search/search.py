@@ -15,7 +15,7 @@ from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import TOLERANCE, model_parameters, nominal_parameters
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, STAGES
 from aeropend_ident.diagnosis.policy import MATERIAL, MATERIAL_SHARE
-from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis, adopted, drop_unneeded
+from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis, Selection, adopted, drop_unneeded
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import (
     Hypothesis,
@@ -372,6 +372,12 @@ def refit(chains: CutChains, stage: str, effects: Sequence[Hypothesis], start: M
         return base
     parameters = [*nominal_parameters(chains, stage), *(p for h in effects for p in h.own)]
     return fit_again(chains.residuals(stage), parameters, start, base)
+
+
+def taken_out(chains: CutChains, findings: Findings, selection: Selection) -> Findings:
+    """The findings of a stage without one of the effects, the others fitted again."""
+    f = findings.without(selection)
+    return replace(f, final=refit(chains, f.stage, f.effects, f.final.values, f.base))
 
 
 def at_end_of_prior(chains: CutChains, stage: str, f: Fit) -> bool:
