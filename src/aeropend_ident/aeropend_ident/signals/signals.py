@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.bags.recording import RecordingError
-from aeropend_ident.signals.noise import innovation_noise, least_noise, white_noise
+from aeropend_ident.signals.noise import innovation_noise, least_noise, quantised_noise, resolution, white_noise
 from aeropend_ident.signals.outliers import far_from_median, jumps_out, saturated
 from aeropend_ident.signals.pulses import UNSURE, Pulses, find_pulses, hold
 from aeropend_ident.signals.variants import SAME, Variant
@@ -329,10 +329,11 @@ def _noise(columns: Mapping[str, Array], duty: Array, sensing: Mapping[str, floa
     """
     sigma = {"omega": max(sensing["speed_noise"], white_noise(columns["omega"][:train]))}
     for channel, key in (("theta", "angle"), ("i_a", "current"), ("v_a", "voltage")):
-        x, quantised = columns[channel][:train], sensing[f"{key}_lsb"] / math.sqrt(12.0)
+        x, stated = columns[channel][:train], sensing[f"{key}_lsb"]
         seen = innovation_noise(x, duty[:train])
-        stated = math.hypot(sensing[f"{key}_noise"], quantised)
-        sigma[channel] = max(stated if seen is None else max(seen, quantised), least_noise(x))
+        if seen is None:
+            seen = math.hypot(sensing[f"{key}_noise"], stated / math.sqrt(12.0))
+        sigma[channel] = max(seen, quantised_noise(x, resolution(x) or stated), least_noise(x))
     return sigma
 
 
