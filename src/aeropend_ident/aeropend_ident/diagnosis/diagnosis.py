@@ -234,16 +234,24 @@ def _without_harmful(fitted: CutChains, found: Found, joint: JointFit, gaps: Gap
                      progress: Progress) -> Measured:
     """Take out the effects that make the gap larger on data that no fit has used.
 
-    These have a negative part, or the others leave less without them, or the run diverges with them. One at a time, the
-    most harmful first: of effects that stand in for each other, one may be needed.
+    These have a negative part, or the others leave less without them, or the run diverges with them. Where the arm
+    rests in the held-out part, a part is one of the whole recording: then the held-out gap must not grow by a material
+    amount. One at a time, the most harmful first: of effects that stand in for each other, one may be needed.
     """
     needed: set[str] = set()
     parts = parts_of(found, joint, gaps, settings)
 
+    def worse() -> bool:
+        grown = gap_share.squared(gaps.after) - gap_share.squared(gaps.before)
+        return gaps.after.diverges or grown > settings.material * gap_share.whole(parts)
+
     def closes(p: Part) -> float:
         return min(p.amount, p.unique) if p.amount >= settings.material * gap_share.whole(parts) else p.amount
 
-    while harmful := [p for p in parts if (closes(p) < 0.0 or gaps.after.diverges) and p.name not in needed]:
+    def effects() -> set[str]:
+        return {h.name for f in joint.findings.values() for h in f.effects} - needed
+
+    while harmful := [p for p in parts if p.name in effects() and (closes(p) < 0.0 or worse())]:
         name = min(harmful, key=closes).name
         without = fit_and_measure(fitted, _without(found, name), progress)
         less = without[2].after.total
