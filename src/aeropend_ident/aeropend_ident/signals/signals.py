@@ -196,9 +196,14 @@ class Signals:
         """[rad/s] (N,) The speed, NaN where it is known to be wrong."""
         return np.where(self.false_speed, np.nan, self.omega)
 
+    @cached_property
+    def measured(self) -> frozenset[str]:
+        """The channels that were measured at all."""
+        return frozenset(name for name in CHANNELS if np.isfinite(self.channel(name)).any())
+
     def has(self, name: str) -> bool:
         """Whether a channel was measured at all."""
-        return bool(np.isfinite(self.channel(name)).any())
+        return name in self.measured
 
 
 def after_unseen(period: float) -> int:

@@ -24,6 +24,12 @@ LONGEST_ARM_STEP = 10e-3
 
 Measured: the angle of `bench` then changes by at most 1e-5 of its range."""
 
+LONGEST_MOTOR_STEP = 5e-3
+"""[s] Longest step of the motor alone where only the arm is read.
+
+Measured: the speed of `bench` and of 13 drawn motors then changes by at most 1e-3 of its range, after a jump of the
+voltage."""
+
 SAMPLED = 64
 """Points at which the slopes of terms by formula are sampled. A choice."""
 
@@ -181,6 +187,19 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD, steps: int = 0, *, full
     if full and e is None:
         e = NO_EFFECT
     return prepared(n, e, added, period, steps or _steps_in(period, *rates(n, e, added, period)))
+
+
+def prepare_motor(model: Model, period: float, longest: float = LONGEST_STEP
+                  ) -> tuple[Coefficients, Values | None, Extra | None, Terms | None]:
+    """As `prepare`, for `run_motor` alone: the rates of the arm do not act on the number of steps.
+
+    Args:
+        model: parameters and effects.
+        period: [s] length of a hold.
+        longest: [s] longest step.
+    """
+    parts = model_parts(model)
+    return prepared(*parts, period, steps_of(period, max(rates(*parts, period)[0], 1.0 / longest)))
 
 
 def prepared(n: Mapping[str, float], e: Values | None, added: Terms | None, period: float, steps: int

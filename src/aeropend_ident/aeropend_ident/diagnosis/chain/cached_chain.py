@@ -16,7 +16,6 @@ from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
 from aeropend_ident.diagnosis.chain.values import Values, acts_on_motor
 from aeropend_ident.diagnosis.policy import UNCALIBRATED, Policy
 from aeropend_ident.signals.signals import Signals
-from aeropend_sim.model.coefficients import steps_in
 from aeropend_sim.model.parameters import Model
 
 Array = NDArray[np.float64]
@@ -34,8 +33,7 @@ class CachedChain(CutChain):
         if s.has("v_a") or s.has("i_a") or s.has("omega"):  # the motor's input changes while the search goes on
             return super().motor(values, stop)
         runs: list[tuple[object, tuple[Array, Array, Array]]] = vars(self).setdefault("kept", [])
-        steps = steps_in(self.valued(values), s.period)
-        wanted = (stop, steps, tuple(sorted((n, v) for n, v in values.items() if acts_on_motor(n))))
+        wanted = (stop, tuple(sorted((n, v) for n, v in values.items() if acts_on_motor(n))))
         k = next((k for k, (other, _) in enumerate(runs) if other == wanted), -1)
         run = runs.pop(k) if k >= 0 else (wanted, super().motor(values, stop))
         runs.append(run)

@@ -27,9 +27,9 @@ from aeropend_ident.signals.pulses import mean_speed
 from aeropend_ident.signals.signals import Signals, split_apply
 from aeropend_ident.signals.smoothing import slow_part
 from aeropend_sim.model import actuator, dynamics, sensing
-from aeropend_sim.model.coefficients import prepare
+from aeropend_sim.model.coefficients import LONGEST_MOTOR_STEP, prepare_motor
 from aeropend_sim.model.effects import CATALOGUE
-from aeropend_sim.model.parameters import Model
+from aeropend_sim.model.parameters import LONGEST_STEP, Model
 from aeropend_sim.model.state import State
 
 Array = NDArray[np.float64]
@@ -70,6 +70,7 @@ class CutChain:
     current: Array
     actuator_values: dict[str, float] = field(default_factory=dict)
     unexplained_voltage: Array = field(default_factory=lambda: np.zeros(0))
+    _last: tuple[Values, Model] | None = field(default=None, init=False, repr=False, compare=False)
 
     @classmethod
     def cut(cls, model: Model, signals: Signals) -> CutChain:
@@ -93,8 +94,10 @@ class CutChain:
                        current=self.current[:n], unexplained_voltage=self.unexplained_voltage[:n])
 
     def valued(self, values: Values) -> Model:
-        """The model with these values."""
-        return with_values(self.model, values)
+        """The model with these values; the last one is kept, as each stage asks for it several times."""
+        if self._last is None or self._last[0] != values:
+            self._last = (dict(values), with_values(self.model, values))
+        return self._last[1]
 
     def pieces(self, values: Values, stop: int | None = None) -> list[tuple[slice, Model]]:
         """The pieces of the recording with the model that acts in each: effects may begin or end."""
@@ -175,10 +178,11 @@ class CutChain:
         else:
             voltage = self._motor_input(values) if DELAY in values else self.voltage
         out = np.empty((3, len(voltage[:stop])))
+        longest = LONGEST_STEP if self.signals.measured - {"theta"} else LONGEST_MOTOR_STEP
         for piece, whole in self.pieces(values, stop):
             m = actuator.behind_terminals(whole)
             true = sensing.true_voltage(m, voltage[piece], self.signals.time[piece])
-            part, prepared = np.full((3, len(true)), np.nan), prepare(m, self.signals.period)
+            part, prepared = np.full((3, len(true)), np.nan), prepare_motor(m, self.signals.period, longest)
             if prepared[0].h >= SHORTEST_STEP:
                 state = dynamics.run_motor(true, state, *prepared, part)
             out[:, piece] = part
