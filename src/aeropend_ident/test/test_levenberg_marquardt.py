@@ -47,3 +47,22 @@ def test_few_derivatives_are_computed_where_the_model_is_nearly_linear():
     a = np.array([found.values[p.name] for p in known])
     assert a + 0.05 * a**2 == pytest.approx(np.linspace(0.1, 1.0, 10), abs=0.02)
     assert len(runs) < 45  # with new derivatives for each of some six steps they are 70
+
+
+def test_derivatives_that_do_not_change_are_computed_anew_only_with_all():
+    runs, linear = [], [f"a{k}" for k in range(20)]
+
+    def bent_in_one(values):
+        runs.append(values)
+        return {"y": sum(values[n] * np.sin((k + 1) * T) for k, n in enumerate(linear)) + np.exp(values["b"] * T)}
+
+    search = Search(bent_in_one, [Parameter(n, 0.1, 1.0) for n in (*linear, "b")])
+    counts = []
+    for whole in (True, False, False, True):
+        before = len(runs)
+        search.renew_slopes(whole=whole)
+        counts.append(len(runs) - before)
+        search.z = search.z + 0.2
+        search.current = search.at(search.z)
+    assert counts == [21, 21, 1, 21]  # the second time shows that twenty of them stay
+    assert search.whole
