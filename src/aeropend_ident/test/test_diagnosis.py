@@ -198,7 +198,8 @@ def test_the_most_harmful_effect_is_taken_out_alone_unless_the_gap_is_then_large
     totals = {frozenset("abc"): 5.0, frozenset("bc"): 4.0, frozenset("b"): 6.0}
 
     def measured(_fitted, found, _progress):
-        return found, None, SimpleNamespace(after=SimpleNamespace(total=totals[found], diverges=False))
+        return found, None, SimpleNamespace(after=SimpleNamespace(total=totals[found], diverges=False),
+                                            before=SimpleNamespace(total=7.0, diverges=False))
 
     monkeypatch.setattr(diagnosis, "parts_of", lambda found, *_: [
         Part(name, "arm", amount, np.zeros(1)) for name, amount in amounts[found].items()])
@@ -210,8 +211,25 @@ def test_the_most_harmful_effect_is_taken_out_alone_unless_the_gap_is_then_large
     assert [p.amount for p in parts] == [4.0, -0.5]
 
 
+@pytest.mark.parametrize(("before", "left"), [(4.0, set()), (4.95, {"a"}), (6.0, {"a"})])
+def test_an_effect_that_closes_a_part_of_the_fitted_data_but_opens_the_held_out_gap_is_taken_out(
+        monkeypatch, before, left):
+    """The arm rests in the held-out part: parts are of the whole recording."""
+    totals = {frozenset("a"): 5.0, frozenset(): before}
+
+    def measured(_fitted, found, _progress):
+        after, nominal = (SimpleNamespace(total=x, diverges=False) for x in (totals[found], before))
+        return found, None, SimpleNamespace(after=after, before=nominal)
+
+    monkeypatch.setattr(diagnosis, "parts_of", lambda found, *_: [Part(n, "arm", 50.0, np.zeros(1)) for n in found])
+    monkeypatch.setattr(diagnosis, "_without", lambda found, name: found - {name})
+    monkeypatch.setattr(diagnosis, "fit_and_measure", measured)
+    start = frozenset("a")
+    assert diagnosis._without_harmful(None, start, None, measured(None, start, None)[2], Settings(), None).found == left
+
+
 def test_what_stays_open_is_unknown_though_the_joint_fit_closes_a_larger_misfit_elsewhere(monkeypatch):
-    monkeypatch.setattr(diagnosis, "learn", lambda *arguments: None)
+    monkeypatch.setattr(diagnosis, "learn", lambda *arguments: [])
     found = diagnose(BENCH, [recorded(71, {"voltage_offset": {"bias": 0.1}})], left_out=["voltage_offset"])
     assert found.conclusions.closure.closed < 0.6
     assert found.body["which"]["verdict"] == "unknown"
@@ -245,7 +263,7 @@ def test_a_learned_term_with_which_the_run_diverges_is_not_kept():
 def test_effects_with_which_the_run_diverges_are_taken_out(monkeypatch):
     def measured(_, found, __):
         after = Gap({"theta": 1e5 if "b" in found else 3.0}, {"theta": 1.0}, np.full((1, 1), 9.0), "b" in found)
-        return found, None, SimpleNamespace(after=after)
+        return found, None, SimpleNamespace(after=after, before=replace(after, rms={"theta": 4.0}, diverges=False))
 
     monkeypatch.setattr(diagnosis, "_without", lambda found, name: found - {name})
     monkeypatch.setattr(diagnosis, "parts_of", lambda found, *_: [

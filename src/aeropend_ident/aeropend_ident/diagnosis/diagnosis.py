@@ -238,28 +238,24 @@ def _without_harmful(fitted: CutChains, found: Found, joint: JointFit, gaps: Gap
     rests in the held-out part, a part is one of the whole recording: then the held-out gap must not grow by a material
     amount. One at a time, the most harmful first: of effects that stand in for each other, one may be needed.
     """
-    needed: set[str] = set()
+    tried: set[str] = set()
     parts = parts_of(found, joint, gaps, settings)
 
     def worse() -> bool:
-        grown = gap_share.squared(gaps.after) - gap_share.squared(gaps.before)
-        return gaps.after.diverges or grown > settings.material * gap_share.whole(parts)
+        return gaps.after.diverges or (gap_share.squared(gaps.after) - gap_share.squared(gaps.before)
+                                       > settings.material * gap_share.whole(parts))
 
     def closes(p: Part) -> float:
         return min(p.amount, p.unique) if p.amount >= settings.material * gap_share.whole(parts) else p.amount
 
-    def effects() -> set[str]:
-        return {h.name for f in joint.findings.values() for h in f.effects} - needed
-
-    while harmful := [p for p in parts if p.name in effects() and (closes(p) < 0.0 or worse())]:
+    while harmful := [p for p in parts if (closes(p) < 0.0 or worse()) and p.name not in tried]:
         name = min(harmful, key=closes).name
+        tried.add(name)  # a nominal parameter may take its part over only against what is known of it
         without = fit_and_measure(fitted, _without(found, name), progress)
         less = without[2].after.total
-        if not (less < gaps.after.total if gaps.after.diverges else less <= gaps.after.total):
-            needed.add(name)  # nominal numbers could take its part over only against what is known of them
-            continue
-        found, joint, gaps = without
-        parts = parts_of(found, joint, gaps, settings)
+        if less < gaps.after.total if gaps.after.diverges else less <= gaps.after.total:
+            found, joint, gaps = without
+            parts = parts_of(found, joint, gaps, settings)
     return Measured(found, joint, gaps, parts)
 
 
@@ -273,16 +269,18 @@ def _with_learned_term(fitted: CutChains, now: Measured, settings: Settings, pro
     if passed(settings.deadline):
         return now._replace(found=replace(found, recordings=[s.noted(NOT_LEARNED) for s in found.recordings]))
     progress("learning the missing term", 0.92)
-    learned = learn(found.chains, joint.findings[unknown.stage], unknown.term.place, settings.jobs)
-    if learned is None:
-        return now
-    stages = {**found.stages, unknown.stage: learned.findings}
-    placed = replace(unknown, term=replace(unknown.term, place=learned.place))
-    closer = measured(fitted, replace(found, stages=stages, unknown=placed, learned=learned), settings, progress)
-    if not closer.closes_more(now, settings.material):
-        effect_file.forget(learned.id)
-        return now
-    return closer
+    tried = []
+    for learned in learn(found.chains, joint.findings[unknown.stage], settings.jobs):
+        stages = {**found.stages, unknown.stage: learned.findings}
+        placed = replace(unknown, term=replace(unknown.term, place=learned.place))
+        with_it = replace(found, stages=stages, unknown=placed, learned=learned)
+        tried.append((learned.id, measured(fitted, with_it, settings, progress)))
+    closing = [one for one in tried if one[1].closes_more(now, settings.material)]
+    best = min(closing, key=lambda one: gap_share.squared(one[1].gaps.after), default=("", now))
+    for id_, _ in tried:
+        if id_ != best[0]:
+            effect_file.forget(id_)
+    return best[1]
 
 
 def _without(found: Found, name: str) -> Found:

@@ -63,6 +63,12 @@ REACH = 30.0
 FIXED = 1e-6
 """Standard deviation of the gain of the term, which is 1: its points have the size (choice: it does not move)."""
 
+ALIKE = 1.0
+"""Difference of log evidence up to which the stage hardly tells two places apart (derived: odds of e to 1).
+
+For the stage of the actuator an error of the voltage's reading is one of the voltage; all stages together tell them
+apart."""
+
 SURE = 1e6
 """Log evidence of a term that is needed in any case (choice: far above any, the verdict is `unknown` already)."""
 
@@ -199,7 +205,7 @@ class Learned:
         return [values[f"{self.id}.{name}"] for name in curve.names]
 
 
-def learn(chains: CutChains, findings: Findings, place: str, jobs: int) -> Learned | None:
+def learn(chains: CutChains, findings: Findings, jobs: int) -> list[Learned]:
     """Learn the term that a stage lacks.
 
     The first curve is fitted at each place where it predicts about as well; the evidence decides between these. Further
@@ -208,24 +214,28 @@ def learn(chains: CutChains, findings: Findings, place: str, jobs: int) -> Learn
     Args:
         chains: cut.
         findings: of the stage, with the effects that stay.
-        place: the likeliest place so far; of places with one evidence it is taken.
         jobs: processes.
 
     Returns:
-        The term; None if no curve predicts blocks of time that it was not fitted to.
+        The term; several at different places if the stage hardly tells these apart; none if no curve predicts blocks of
+        time that it was not fitted to.
     """
     system = _System.of(chains, findings, (), jobs)
     begun = [((system.curves[j],), values) for j, values in system.first()]
     for curves, _ in begun:
         defined(curves)  # here, so that it is known beyond the copies of this process that fit
     first = parallel(jobs, lambda one: _fitted(chains, findings, *one), begun)
-    if not first:
-        return None
     ess = largest_ess(one.fit for one in first)
-    best = max(first, key=lambda one: (one.fit.log_evidence(ess), one.curves[0].form.place == place))
+    evidence = [one.fit.log_evidence(ess) for one in first]
+    best = [one for one, its in zip(first, evidence, strict=True) if its >= max(evidence) - ALIKE]
     for one in first:
-        if one is not best:
+        if one not in best:
             effect_file.forget(one.id)
+    return [_with_further_curves(chains, findings, one, jobs) for one in best]
+
+
+def _with_further_curves(chains: CutChains, findings: Findings, best: _Fitted, jobs: int) -> Learned:
+    """The term with as many curves as are worth it."""
     while len(best.curves) < MOST_CURVES and best.fit.mean_square > GOOD_ENOUGH**2:
         system = _System.of(chains, replace(findings, final=best.fit), best.curves, jobs)
         following = system.next()
@@ -241,7 +251,7 @@ def learn(chains: CutChains, findings: Findings, place: str, jobs: int) -> Learn
     return Learned(best.id, best.curves[0].form.place, best.curves, stage, findings)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Fitted:
     """A term with its fit."""
 
