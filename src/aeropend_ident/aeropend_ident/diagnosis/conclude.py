@@ -13,7 +13,7 @@ from aeropend_ident.diagnosis import experiment_design, gap_share, regions, sinc
 from aeropend_ident.diagnosis.chain import driven_rig
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import CHOSEN, OF_THE_ARM, UNCALIBRATED_SD, ZERO, basis, model_parameters
-from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, FILTER, STAGES, limits, neutral, of_rig, with_values
+from aeropend_ident.diagnosis.chain.values import FILTER, STAGES, limits, neutral, of_rig, with_values
 from aeropend_ident.diagnosis.document import (
     CANNOT_TELL,
     Candidate,
@@ -46,16 +46,15 @@ from aeropend_ident.diagnosis.measured import (
     parts_of_parameters,
     share_of_learned,
 )
-from aeropend_ident.diagnosis.policy import CALIBRATED, GOOD_ENOUGH, MATERIAL_SHARE, angle_only
+from aeropend_ident.diagnosis.policy import CALIBRATED, GOOD_ENOUGH, angle_only
+from aeropend_ident.diagnosis.search.alike import closing_as_much
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis
 from aeropend_ident.diagnosis.search.formula_fit import fitted_formulas
 from aeropend_ident.diagnosis.search.free_curves import MissingTerm
 from aeropend_ident.diagnosis.search.learned_term import Learned
 from aeropend_ident.diagnosis.search.onset import Onset
-from aeropend_ident.diagnosis.search.search import refit
-from aeropend_ident.diagnosis.search.selection import FORM_SHOWS, mean_square, plausible, squared_gap
+from aeropend_ident.diagnosis.search.selection import plausible
 from aeropend_ident.diagnosis.strength import Strengths
-from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_ident.signals.signals import CHANNELS, Mounting, Signals
 from aeropend_ident.signals.statistics import Z95, rms
@@ -326,7 +325,7 @@ def not_separable(chains: CutChains, findings: Mapping[str, Findings]
                 continue
             first, *rest = selection
             doubted = [r for r in rest if r.probability <= chains.policy.undecided]
-            alike = _closing_as_much(chains, f, before, first, doubted) if selection in f.found else set()
+            alike = closing_as_much(chains, f, before, first, doubted) if selection in f.found else set()
             pairs += [(first, r) for r in rest
                       if r.probability > chains.policy.undecided or r.hypothesis.name in alike]
             before = first.fit
@@ -343,37 +342,6 @@ def stand_ins(parts: Sequence[gap_share.Part], findings: Mapping[str, Findings]
     """
     found = {s[0].hypothesis.name: s[0] for f in findings.values() for s in f.found}
     return [(found[p.instead_of], found[p.name]) for p in parts if p.instead_of]
-
-
-def _closing_as_much(chains: CutChains, findings: Findings, before: Fit, first: RankedHypothesis,
-                     rivals: Sequence[RankedHypothesis]) -> set[str]:
-    """Names of the rivals of an effect found that close as much of the gap, while neither explains all.
-
-    What both leave may then decide between them, if it is more than that by which they differ. A parameter that is off
-    only stands in for an effect. Of several effects of a stage, each rival is fitted beside the others.
-
-    Args:
-        chains: cut.
-        findings: of the stage.
-        before: the fit before the effect was found.
-        first: the effect.
-        rivals: of the same selection.
-    """
-    stage, best = findings.stage, first.fit
-    rivals = [r for r in rivals if not r.hypothesis.parameter]
-    fits = [r.fit for r in rivals]
-    if not rivals or mean_square(best, stage) < FORM_SHOWS:
-        return set()
-    if len(findings.effects) > 1:
-        beside = [h for h in findings.effects if h is not first.hypothesis]
-        rivals = [r for r in rivals if r.gain > 0.0 and r.hypothesis.family not in {h.family for h in beside}]
-        best, now = findings.final, findings.final.values
-        fits = [refit(chains, stage, [*beside, r.hypothesis],
-                      {**now, **{p.name: r.fit.values[p.name] for p in r.hypothesis.own}}) for r in rivals]
-        before = refit(chains, stage, beside, now) if rivals else before
-    open_, least, *left = (squared_gap(chains, f, CHANNELS_OF[stage]) for f in (before, best, *fits))
-    alike = min(MATERIAL_SHARE * (open_ - least), least)
-    return {r.hypothesis.name for r, x in zip(rivals, left, strict=True) if x - least < alike}
 
 
 def sets(findings: Mapping[str, Findings]) -> tuple[EffectSet, ...]:

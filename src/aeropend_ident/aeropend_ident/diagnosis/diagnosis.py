@@ -53,6 +53,7 @@ from aeropend_ident.diagnosis.measured import (
 )
 from aeropend_ident.diagnosis.policy import MATERIAL_SHARE, angle_only, policy_of
 from aeropend_ident.diagnosis.search import gust, onset, speed_spikes, unknown_effect
+from aeropend_ident.diagnosis.search.alike import with_simpler
 from aeropend_ident.diagnosis.search.findings import Findings
 from aeropend_ident.diagnosis.search.learned_term import learn
 from aeropend_ident.diagnosis.search.search import search, taken_out, trifling_gap, unsearched
@@ -348,6 +349,8 @@ def _find(fitted: CutChains, settings: Settings, progress: Progress) -> Found:
     stages, begun = searched(chains, nominal), None
     if not passed(deadline):
         chains, stages, begun = onset.search_within_windows(chains, stages, searched)
+    if not passed(deadline):
+        stages = {b: with_simpler(chains, f) for b, f in stages.items()}
     recordings = [replace(s, window=c.window).noted(*fitted.notes)
                   for s, c in zip(recordings, chains.recordings, strict=True)]
     if any(f.cut_short for f in stages.values()):
