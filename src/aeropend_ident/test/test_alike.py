@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from aeropend_ident.diagnosis.policy import CALIBRATED, MATERIAL_SHARE
@@ -43,3 +45,16 @@ def test_of_effects_that_close_as_much_the_one_with_fewer_parameters_comes_first
 @pytest.mark.parametrize("rival", ["cable_torque", "parameter_mismatch:mgd_over_J"])
 def test_neither_an_effect_with_as_many_parameters_nor_a_parameter_takes_its_place(monkeypatch, rival):
     assert taken(monkeypatch, LEAST, 0.2, 1.5, rival=rival) == "encoder_eccentricity"
+
+
+def test_the_final_fit_is_of_the_stage_alone(monkeypatch):
+    """An effect that acts on later stages was fitted to them too."""
+    alone = estimate({}, {})
+    monkeypatch.setattr(alike, "refit", lambda chains, stage, effects, values: alone)
+    base, one = (replace(estimate({}, {}), residuals={"v_a": np.ones(9)}) for _ in range(2))
+    other = replace(one, residuals={"v_a": np.ones(9), "i_a": np.ones(9)})
+    monkeypatch.setattr(alike, "squared_gap", lambda chains, f, channels: OPEN if f is base else LEAST)
+    selection = (RankedHypothesis(BY_NAME["winding_heating"], one, 30.0, 0.8),
+                 RankedHypothesis(BY_NAME["voltage_offset"], other, 20.0, 0.2))
+    chains = SimpleNamespace(policy=CALIBRATED, known=None)
+    assert with_simpler(chains, Findings("actuator", base, one, found=(selection,))).final is alone

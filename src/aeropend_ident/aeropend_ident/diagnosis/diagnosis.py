@@ -55,8 +55,9 @@ from aeropend_ident.diagnosis.policy import MATERIAL_SHARE, angle_only, policy_o
 from aeropend_ident.diagnosis.search import gust, onset, speed_spikes, unknown_effect
 from aeropend_ident.diagnosis.search.alike import with_simpler
 from aeropend_ident.diagnosis.search.findings import Findings
-from aeropend_ident.diagnosis.search.learned_term import learn
+from aeropend_ident.diagnosis.search.learned_term import Learned, learn
 from aeropend_ident.diagnosis.search.search import search, taken_out, trifling_gap, unsearched
+from aeropend_ident.diagnosis.search.unknown_effect import UnknownEffect
 from aeropend_ident.estimation.deadline import passed
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.signals.signals import Signals
@@ -270,18 +271,20 @@ def _with_learned_term(fitted: CutChains, now: Measured, settings: Settings, pro
     if passed(settings.deadline):
         return now._replace(found=replace(found, recordings=[s.noted(NOT_LEARNED) for s in found.recordings]))
     progress("learning the missing term", 0.92)
-    tried = []
-    for learned in learn(found.chains, joint.findings[unknown.stage], settings.jobs):
-        stages = {**found.stages, unknown.stage: learned.findings}
-        placed = replace(unknown, term=replace(unknown.term, place=learned.place))
-        with_it = replace(found, stages=stages, unknown=placed, learned=learned)
-        tried.append((learned.id, measured(fitted, with_it, settings, progress)))
-    closing = [one for one in tried if one[1].closes_more(now, settings.material)]
-    best = min(closing, key=lambda one: gap_share.squared(one[1].gaps.after), default=("", now))
-    for id_, _ in tried:
-        if id_ != best[0]:
-            effect_file.forget(id_)
-    return best[1]
+    terms = learn(found.chains, joint.findings[unknown.stage], settings.jobs)
+    tried = [measured(fitted, _with_term(found, unknown, learned), settings, progress) for learned in terms]
+    best = min((one for one in tried if one.closes_more(now, settings.material)),
+               key=lambda one: gap_share.squared(one.gaps.after), default=now)
+    for learned in terms:
+        if learned is not best.found.learned:
+            effect_file.forget(learned.id)
+    return best
+
+
+def _with_term(found: Found, unknown: UnknownEffect, learned: Learned) -> Found:
+    """The findings with a learned term, at its place, in place of the unknown effect."""
+    return replace(found, stages={**found.stages, unknown.stage: learned.findings}, learned=learned,
+                   unknown=replace(unknown, term=replace(unknown.term, place=learned.place)))
 
 
 def _without(found: Found, name: str) -> Found:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
 from aeropend_ident.diagnosis.chain.values import Values, acts_on_motor
-from aeropend_ident.diagnosis.policy import UNCALIBRATED, Policy
+from aeropend_ident.diagnosis.policy import UNCALIBRATED, Policy, angle_only
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model.parameters import Model
 
@@ -29,8 +29,7 @@ class CachedChain(CutChain):
 
     def motor(self, values: Values, stop: int | None = None) -> tuple[Array, Array, Array]:
         """As `CutChain.motor`."""
-        s = self.signals
-        if s.has("v_a") or s.has("i_a") or s.has("omega"):  # the motor's input changes while the search goes on
+        if not angle_only([self.signals]):  # the motor's input changes while the search goes on
             return super().motor(values, stop)
         runs: list[tuple[object, tuple[Array, Array, Array]]] = vars(self).setdefault("kept", [])
         wanted = (stop, tuple(sorted((n, v) for n, v in values.items() if acts_on_motor(n))))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.known import Known
 from aeropend_ident.diagnosis.chain.values import STAGES, Values, with_values, without_effects
-from aeropend_ident.diagnosis.policy import CALIBRATED, Policy
+from aeropend_ident.diagnosis.policy import CALIBRATED, Policy, angle_only
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.estimation.residuals import finite
 from aeropend_ident.interrupt import check
@@ -178,7 +178,7 @@ class CutChain:
         else:
             voltage = self._motor_input(values) if DELAY in values else self.voltage
         out = np.empty((3, len(voltage[:stop])))
-        longest = LONGEST_STEP if self.signals.measured - {"theta"} else LONGEST_MOTOR_STEP
+        longest = LONGEST_MOTOR_STEP if angle_only([self.signals]) else LONGEST_STEP
         for piece, whole in self.pieces(values, stop):
             m = actuator.behind_terminals(whole)
             true = sensing.true_voltage(m, voltage[piece], self.signals.time[piece])

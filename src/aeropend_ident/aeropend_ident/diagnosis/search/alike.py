@@ -81,10 +81,12 @@ def with_simpler(chains: CutChains, findings: Findings) -> Findings:
     before = findings.base
     for selection in findings.found:
         first, *rest = selection
-        simpler = [r for r in rest if len(r.hypothesis.own) < len(first.hypothesis.own)]
+        shows = mean_square(first.fit, findings.stage) >= FORM_SHOWS
+        simpler = [r for r in rest if len(r.hypothesis.own) < len(first.hypothesis.own)
+                   and (shows or r.probability > CALIBRATED.undecided)]
         least, alike = _alike(chains, findings, before, first, simpler)
-        before, shows = first.fit, mean_square(first.fit, findings.stage) >= FORM_SHOWS
-        alike = [r for r in alike if r.ranked.probability > CALIBRATED.undecided or (shows and r.more < least)]
+        alike = [r for r in alike if r.ranked.probability > CALIBRATED.undecided or r.more < least]
+        before = first.fit
         if alike:
             best = min(alike, key=lambda r: len(r.ranked.hypothesis.own))
             even = 0.5 * (first.probability + best.ranked.probability)
@@ -92,4 +94,6 @@ def with_simpler(chains: CutChains, findings: Findings) -> Findings:
                        *(r for r in rest if r is not best.ranked))
             findings = replace(findings, final=best.fit, sets=(), found=tuple(
                 swapped if s is selection else s for s in findings.found))
+            if set(best.fit.residuals) != set(findings.base.residuals):  # it was fitted to later stages too
+                findings = replace(findings, final=refit(chains, findings.stage, findings.effects, best.fit.values))
     return findings
