@@ -92,7 +92,7 @@ class Search:
         self.current = self.at(self.z)
         self.slopes: dict[str, Sensitivities] = {}
         self.steady = np.zeros(len(self.z), bool)
-        self.due = self.last = False  # whether derivatives are computed before the next step; all of them
+        self.due = True  # whether derivatives are computed before the next step
         self.fresh = self.whole = False  # whether derivatives were computed at this point; all of them
         self.ended = False
         self.renew_weights()
@@ -110,16 +110,13 @@ class Search:
         """Weighted residuals of all channels as one vector."""
         return np.concatenate([self.weight[k] * residuals[k] for k in self.weight] or [np.zeros(0)])
 
-    def renew_slopes(self, *, whole: bool) -> None:
-        """Compute derivatives anew at this point.
+    def renew_slopes(self) -> None:
+        """Compute derivatives anew at this point; those that are steady stay as they were corrected.
 
-        Args:
-            whole: all of them. Otherwise a derivative stays as it was corrected, if computing it anew the last time
-                changed it by less than `STEADY`.
+        A derivative is steady if computing it anew the last time changed it by less than `STEADY`.
         """
-        before, steady = self.slopes, self.steady
-        self.slopes = self.differences(kept={} if whole else before)
-        self.fresh, self.whole = True, whole or not steady.any()
+        before, self.fresh, self.whole = self.slopes, True, not self.steady.any()
+        self.slopes = self.differences(kept=before)
         if before:
             changed = np.zeros(len(self.z))
             for k, s in self.slopes.items():
@@ -278,8 +275,8 @@ class Search:
         for done in range(steps):
             if done and passed(deadline):
                 break
-            if self.due or not self.slopes:
-                self.renew_slopes(whole=self.last or not self.slopes)
+            if self.due:
+                self.renew_slopes()
                 self.due = False
             r = self.stack(self.current)
             information, gradient, products = self.normal_equations(self.weighted(self.slopes))
@@ -309,6 +306,8 @@ class Search:
             self.ended = ended and (self.whole or first_look) and not bent
             if self.ended:
                 break
-            self.due, self.last = ended or not straight, ended and self.fresh
+            self.due = ended or not straight
+            if ended and self.fresh:  # all derivatives confirm the end
+                self.steady[:] = False
             self.fresh = self.whole = False
         return products
