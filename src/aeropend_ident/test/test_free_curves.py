@@ -170,5 +170,5 @@ def test_motor_answers_a_small_voltage_as_the_simulation_does():
 
 @pytest.mark.filterwarnings("error")
 def test_a_response_that_diverges_has_numbers_all_the_same():
-    s = replace(recording({}, duration=10.0), period=2.0, pulses=None)
+    s = replace(recording({}, duration=6.0), period=2.0, pulses=None)
     assert all(np.isfinite(term.left) for term in found("motor", s))

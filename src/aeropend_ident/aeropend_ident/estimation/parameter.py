@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -12,6 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+LARGEST_POWER = 709.0
+"""Power of e below which it is a number (derived: e^709.8 is the largest one)."""
 
 
 class Key(NamedTuple):
@@ -92,8 +96,8 @@ class Parameter:
         """The inverse of `to_standard`."""
         if not self.log:
             return float(self.mean + self.sd * z)
-        with np.errstate(over="ignore"):  # an extrapolation may go anywhere before its bounds hold it
-            return float(self.mean * np.exp(self.sd * z))
+        power = self.sd * z  # an extrapolation may go anywhere before its bounds hold it
+        return float(self.mean * math.exp(power)) if power < LARGEST_POWER else math.inf
 
     def slope(self, z: float) -> float:
         """Derivative of the value with respect to z."""

@@ -168,7 +168,7 @@ class Signals:
         """First sample whose voltage cannot come from a duty before the recording, whatever the command delay."""
         return after_unseen(self.period)
 
-    @property
+    @cached_property
     def both_ways(self) -> bool:
         """Whether the motor is driven in both directions."""
         return bool(np.min(self.duty) < 0.0)
@@ -177,7 +177,7 @@ class Signals:
         """A speed of the rotor (N,) that is at least 0, unless the motor is driven both ways."""
         return omega if self.both_ways else np.maximum(omega, 0.0)
 
-    @property
+    @cached_property
     def largest_duty(self) -> float:
         """The largest duty, either way."""
         return float(np.abs(self.duty).max())

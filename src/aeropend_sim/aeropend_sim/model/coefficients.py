@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from aeropend_sim.compiled import njit
 from aeropend_sim.model import actuator
 from aeropend_sim.model.effects import NO_EFFECT, THRUST_PIVOT_SPEED, Values, values
-from aeropend_sim.model.lag import NO_LAG, Lag, lag
+from aeropend_sim.model.lag import NO_LAG, Lag, cached_lag
 from aeropend_sim.model.parameters import LONGEST_STEP, SAMPLE_PERIOD, Model
 from aeropend_sim.model.terms import EMPTY, NUDGE, Quantities, Terms, term_sum, terms
 
@@ -207,13 +207,15 @@ def prepared(n: Mapping[str, float], e: Values | None, added: Terms | None, peri
     """As `prepare`, from the parts of a model and the number of steps."""
     h = period / steps
     resistance = n["R_a"] + (e.supply_sag_r_supply if e else 0.0)
-    c = Coefficients(steps, h, lag(resistance / n["L_a"], h), lag(n["B_m"] / n["J_m"], h), 1.0 / n["L_a"],
-                     n["K_e"], n["K_t"] / n["J_m"], n["k_load"] / n["J_m"], n["B_m"] / n["J_m"], n["k_thrust"],
-                     n["mgd_over_J"], n["c_over_J"], n["L_over_J"])
+    c = Coefficients(steps, h, cached_lag(resistance / n["L_a"], h), cached_lag(n["B_m"] / n["J_m"], h),
+                     1.0 / n["L_a"], n["K_e"], n["K_t"] / n["J_m"], n["k_load"] / n["J_m"], n["B_m"] / n["J_m"],
+                     n["k_thrust"], n["mgd_over_J"], n["c_over_J"], n["L_over_J"])
     if e is None:
         return c, None, None, None
     rise = 1.0 / e.thrust_lag_tau if e.thrust_lag_tau > NO_LAG * h else 0.0
     gust_decay = math.exp(-period / e.gust_tau)
-    return c, e, Extra(lag(1.0 / e.winding_heating_tau, h), lag(rise, h), lag(rise / e.thrust_lag_fall, h), n["R_a"],
-                       resistance, n["J_m"], gust_decay, e.gust_sigma * math.sqrt(1.0 - gust_decay**2),
-                       1.0 / (1.0 - e.mast_flex_coupling), 1.0 / e.ground_effect_width), added
+    cooling, air, falling_air = (cached_lag(rate, h) for rate in (
+        1.0 / e.winding_heating_tau, rise, rise / e.thrust_lag_fall))
+    return c, e, Extra(cooling, air, falling_air, n["R_a"], resistance, n["J_m"], gust_decay,
+                       e.gust_sigma * math.sqrt(1.0 - gust_decay**2), 1.0 / (1.0 - e.mast_flex_coupling),
+                       1.0 / e.ground_effect_width), added

@@ -2,6 +2,7 @@
 """A first-order lag over one step, exact for an input that is quadratic (Cox & Matthews 2002)."""
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 from aeropend_sim.compiled import equation
@@ -41,6 +42,10 @@ def lag(a: float, h: float) -> Lag:
     s = 0.5 * h
     return Lag(full, h * (p1 - 3.0 * p2 + 4.0 * p3), h * (4.0 * p2 - 8.0 * p3), h * (4.0 * p3 - p2),
                half, s * (q1 - 1.5 * q2 + q3), s * (2.0 * q2 - 2.0 * q3), s * (q3 - 0.5 * q2))
+
+
+cached_lag = lru_cache(maxsize=256)(lag)
+"""`lag` for code that is not compiled: most of the lags of a model stay when one parameter changes."""
 
 
 @equation

@@ -120,8 +120,10 @@ def winding_rotor(i0: float, w0: float, v: float, heat: float, past: Pasts | Non
         if w0 < 0.0 or (w0 == 0.0 and drive < 0.0):
             friction = -friction
     slope = c.h * (c.torque * i0 - c.load * w0 * abs(w0) - c.drag * w0 - friction)
+    more0 = 0.0
     if added is not None and added.rotor > added.electrical:
-        slope += c.h * rotor_terms(i0, w0, v, past.start, added) / x.J_m
+        more0 = rotor_terms(i0, w0, v, past.start, added) / x.J_m
+        slope += c.h * more0
     wm, w1 = w0 + 0.5 * slope, w0 + slope
     if sticks:
         wm, w1 = 0.0, 0.0
@@ -144,8 +146,7 @@ def winding_rotor(i0: float, w0: float, v: float, heat: float, past: Pasts | Non
         if sticks:
             wm, w1 = breakaway(Over(c.torque * i0, c.torque * im, c.torque * i1), abs(friction), 0.5 * c.h)
         elif added is not None and added.rotor > added.electrical:
-            torque = Over(rotor_terms(i0, w0, v, past.start, added) / x.J_m,
-                          rotor_terms(im, wm, v, past.middle, added) / x.J_m,
+            torque = Over(more0, rotor_terms(im, wm, v, past.middle, added) / x.J_m,
                           rotor_terms(i1, w1, v, past.end, added) / x.J_m)
             wm, w1 = rotor(Over(i0, im, i1), Over(w0, wm, w1), friction, c, torque)
         else:

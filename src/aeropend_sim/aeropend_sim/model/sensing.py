@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from aeropend_sim.compiled import equation, njit
 from aeropend_sim.model.dynamics import ROW
 from aeropend_sim.model.effects import DEFINED, SPIKE_FACTOR
-from aeropend_sim.model.lag import NO_LAG, Lag, lag
+from aeropend_sim.model.lag import NO_LAG, Lag, cached_lag
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 from aeropend_sim.model.terms import EMPTY, Quantities, Terms, series, term_sum, terms
 
@@ -230,7 +230,7 @@ def prepare(model: Model, period: float = SAMPLE_PERIOD) -> MeasurementChain:
         period: [s] time between samples.
     """
     s, effect = model.sensing, model.effect
-    first, second = (FilterStage(lag(rate, period), rate) for rate in (
+    first, second = (FilterStage(cached_lag(rate, period), rate) for rate in (
         1.0 / tau if tau > NO_LAG * period else 0.0 for tau in filter_stages(model)))
     return MeasurementChain(
         h=period, first=first, second=second, bias=effect("angle_offset", "bias"),
