@@ -2,6 +2,7 @@
 """The cut chains of one or more recordings."""
 
 from collections import Counter
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -30,6 +31,29 @@ def test_the_training_part_alone_has_the_same_residuals(chains, stage):
     assert list(whole) == list(head)
     for channel, r in whole.items():
         np.testing.assert_array_equal(r, head[channel])
+
+
+@pytest.mark.parametrize("channels", [(), ("omega", "i_a")])
+def test_chains_that_keep_their_last_runs_give_what_new_ones_give(channels):
+    signals = [recorded(4, duration=6.0, without=channels)]
+    chains = CutChains(BENCH, signals)
+    tried = [{}, {"R_a": 1.2}, {"voltage_offset.bias": 0.2}, {"current_gain.gain": 0.1}, {}, {"angle_offset.bias": 0.1},
+             {"initial.theta": 0.2}, {"sensing.angle_filter_tau": 0.02}, {"c_over_J": 0.5}, {"initial.omega": 30.0},
+             {"command_delay.delay": 0.03}, {"encoder_eccentricity.amplitude": 0.1}, {}]
+    for described in ({}, {"k1": 0.9 * BENCH.model["k1"]}):
+        new = CutChains(BENCH, signals)
+        for each in (chains, new):
+            each.set_next_input("actuator", described)
+            each.set_next_input("motor", {**described, "J_m": 1.1 * BENCH.model["J_m"]})
+        for stage in STAGES:
+            for values in tried:
+                fresh = copy(new)
+                fresh.each = [replace(chain) for chain in new.each]
+                expected = fresh.residuals(stage)(values)
+                found = chains.residuals(stage)(values)
+                assert found.keys() == expected.keys()
+                for channel, r in expected.items():
+                    np.testing.assert_array_equal(found[channel], r)
 
 
 @pytest.mark.promise("Verdict", "A large recording does not need more memory for the search of free curves")

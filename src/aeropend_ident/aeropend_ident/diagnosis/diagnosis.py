@@ -19,8 +19,8 @@ from threadpoolctl import threadpool_limits
 from aeropend_ident.bags.recording import RecordingError
 from aeropend_ident.diagnosis import gap_share, regions, typed_json
 from aeropend_ident.diagnosis.chain import static_map
-from aeropend_ident.diagnosis.chain.cached_chain import CachedChains
 from aeropend_ident.diagnosis.chain.chain import CutChains
+from aeropend_ident.diagnosis.chain.counted_chains import CountedChains
 from aeropend_ident.diagnosis.chain.driven_rig import DrivenRig, fit_driven_rig, fit_own, without_findings
 from aeropend_ident.diagnosis.chain.free_run import free_run
 from aeropend_ident.diagnosis.chain.hanging import mounted
@@ -147,7 +147,7 @@ def diagnose(model: Model, recordings: Sequence[Signals], jobs: int = 1, progres
             model, recordings = fit_nominal_model(model, recordings, deadline)
         if policy.calibrated:
             _refuse_divergence(model, recordings)
-        kind = CutChains if policy.calibrated else CachedChains
+        kind = CutChains if policy.calibrated else CountedChains
         chains = with_pwm_timing(kind(model, recordings, policy))
         if rig is not None:
             chains.state, chains.plain, chains.notes = rig.state, rig.plain, rig.notes

@@ -99,7 +99,7 @@ class Search:
 
     def at(self, z: Array) -> dict[str, Array]:
         """Residuals at a point z (P,) in standard units."""
-        values = {p.name: p.value(x) for p, x in zip(self.parameters, z, strict=True)}
+        values = {p.name: p.value(x) for p, x in zip(self.parameters, z.tolist(), strict=True)}
         return {k: finite(np.asarray(r)) for k, r in self.residuals(values).items() if len(r)}
 
     def renew_weights(self) -> None:
@@ -172,16 +172,17 @@ class Search:
         for k, each in by.items():
             own = np.array([j for j in each if j >= 0], int)
             slopes[k] = Sensitivities(own, np.empty((len(own), len(self.current[k]))))
-        filled = dict.fromkeys(slopes, 0)
-        for at, group in enumerate(groups.values()):
+        left = {k: len(s.by) for k, s in slopes.items()}
+        # the last ones first: those of a reading come last, and need no run but that at this point, which is known
+        for at, group in reversed(list(enumerate(groups.values()))):
             keep = bool(kept) and self.steady[list(group.values())].all()
             if not keep:
                 moved = self._with(group, after)
                 still = self.current if before is None else self._with(group, before)
             for k, s in slopes.items():
                 if (j := by[k][at]) >= 0:
-                    s.rows[filled[k]] = kept[k].rows[filled[k]] if keep else (moved[k] - still[k]) / moves[j]
-                    filled[k] += 1
+                    left[k] -= 1
+                    s.rows[left[k]] = kept[k].rows[left[k]] if keep else (moved[k] - still[k]) / moves[j]
         return slopes
 
     def _with(self, group: Mapping[int, int], values: Array) -> dict[str, Array]:

@@ -18,7 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.known import Known
-from aeropend_ident.diagnosis.chain.values import STAGES, Values, with_values, without_effects
+from aeropend_ident.diagnosis.chain.last_runs import LastRuns
+from aeropend_ident.diagnosis.chain.values import (
+    STAGES,
+    Values,
+    acts_on_arm,
+    acts_on_motor,
+    with_values,
+    without_effects,
+)
 from aeropend_ident.diagnosis.policy import CALIBRATED, Policy, angle_only
 from aeropend_ident.estimation.parameter import key
 from aeropend_ident.estimation.residuals import finite
@@ -71,6 +79,9 @@ class CutChain:
     actuator_values: dict[str, float] = field(default_factory=dict)
     unexplained_voltage: Array = field(default_factory=lambda: np.zeros(0))
     _last: tuple[Values, Model] | None = field(default=None, init=False, repr=False, compare=False)
+    _motor_runs: LastRuns[tuple[Array, Array, Array]] = field(default_factory=LastRuns, init=False, repr=False,
+                                                              compare=False)
+    _motions: LastRuns[tuple[Array, Array]] = field(default_factory=LastRuns, init=False, repr=False, compare=False)
 
     @classmethod
     def cut(cls, model: Model, signals: Signals) -> CutChain:
@@ -117,8 +128,8 @@ class CutChain:
             n = m.numbers()
             # the duty before the recording is taken from the first voltage: with a delay it acts for a while
             first = s.v_a[0] if np.isfinite(s.v_a[0]) else actuator.voltage_at(n, values.get("initial.omega", 0.0))
-            before = float(np.nan_to_num(actuator.duty(n, first)))
-            v = of(n, s.duty, m.effects, s.period, start=-piece.start, before=before)
+            before = actuator.duty(n, first)
+            v = of(n, s.duty, m.effects, s.period, start=-piece.start, before=before if math.isfinite(before) else 0.0)
             seen = actuator.terminal_voltage(m, v[piece], self.current[piece], s.period)
             out[piece] = sensing.read_voltage(m, seen, s.time[piece])
         return out
@@ -139,6 +150,8 @@ class CutChain:
         """Set the motor's input to the measured voltage, described by the actuator with these values."""
         self.actuator_values, self.unexplained_voltage = dict(values), self._unexplained_voltage(values)
         self.voltage = self._motor_input({})
+        self._motor_runs.forget()
+        self._motions.forget()
 
     def _unexplained_voltage(self, values: Values) -> Array:
         s = self.signals
@@ -170,7 +183,12 @@ class CutChain:
 
         Returns:
             [A] current, [rad/s] speed and [rad] rotor angle, (N,) each; NaN of values with which no motor is so fast.
+            They are kept, and must not be changed.
         """
+        acting = {name: x for name, x in values.items() if acts_on_motor(name)}
+        return self._motor_runs.of((stop, acting), lambda: self._turn(values, stop))
+
+    def _turn(self, values: Values, stop: int | None) -> tuple[Array, Array, Array]:
         first = float(self.signals.i_a[0]) if np.isfinite(self.signals.i_a[0]) else 0.0
         state = State(i_a=first, omega=values.get("initial.omega", 0.0))
         if not self.signals.has("v_a"):
@@ -208,6 +226,7 @@ class CutChain:
         """Set the arm's input to the measured speed, described by the motor with these values."""
         s = self.signals
         _, omega, angle = self.motor(values)
+        omega = omega.copy()
         if s.pulses is not None and (~s.pulses.false).sum() > 2:
             p = s.pulses.of(~s.pulses.false)
             error = p.omega - mean_speed(angle, p.time, p.period, s.period)
@@ -219,27 +238,28 @@ class CutChain:
             clean = partial(slow_part, width=round(SPEED_SETTLES / s.period), sigma=s.sigma["omega"])
             omega = omega + split_apply(clean, s.true_speed - omega, s.train)
         self.speed = s.turning(omega)
+        self._motions.forget()
 
     # --- arm: speed -> angle
 
     def arm(self, values: Values, stop: int | None = None) -> Array:
         """[rad] Angle (N,) as it would be read, before noise and quantisation; arguments as for `motor`."""
-        pieces = self.pieces(values, stop)
-        theta, rate = self._motion(values, pieces, stop)
+        theta, rate = self.arm_motion(values, stop)
         s, out = self.signals, np.empty(len(theta))
-        for piece, m in pieces:
+        for piece, m in self.pieces(values, stop):
             out[piece] = sensing.read_angle(m, theta, rate, s.period)[piece]
         return out
 
     def arm_motion(self, values: Values, stop: int | None = None) -> tuple[Array, Array]:
-        """True angle [rad] and angular rate [rad/s], (N,) each; arguments as for `motor`."""
-        return self._motion(values, self.pieces(values, stop), stop)
+        """True angle [rad] and angular rate [rad/s], (N,) each; arguments, and what is kept, as for `motor`."""
+        acting = {name: x for name, x in values.items() if acts_on_arm(name)}
+        return self._motions.of((stop, acting), lambda: self._swing(values, stop))
 
-    def _motion(self, values: Values, pieces: Sequence[tuple[slice, Model]], stop: int | None) -> tuple[Array, Array]:
-        s = self.signals
+    def _swing(self, values: Values, stop: int | None) -> tuple[Array, Array]:
+        s, pieces = self.signals, self.pieces(values, stop)
         n = pieces[0][1].numbers()
         cut = s.has("omega") or s.has("i_a")
-        if not cut and not s.duty.any() and "initial.omega" not in values and actuator.voltage(n, 0.0) == 0.0:
+        if not cut and s.largest_duty == 0.0 and "initial.omega" not in values and actuator.voltage(n, 0.0) == 0.0:
             speed = np.zeros(len(s))[:stop]  # the rotor stands
         else:
             speed = self.speed[:stop] if cut else s.turning(self.motor(values, stop)[1])
@@ -319,6 +339,8 @@ class CutChains:
                 for chain, own in zip(self.each, self._estimates_of_each(values), strict=True)]
 
     def _estimates_of_each(self, values: Values) -> list[dict[str, float]]:
+        if len(self.each) == 1:
+            return [{n: v for n, v in values.items() if not key(n).recording}]
         shared: dict[str, float] = {}
         own: list[dict[str, float]] = [{} for _ in self.each]
         for name, value in values.items():

@@ -5,28 +5,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis.chain.values import acts_on_motor, with_values, without_effects
+from aeropend_ident.diagnosis.chain.last_runs import LastRuns
+from aeropend_ident.diagnosis.chain.values import acts_on_arm, acts_on_motor, with_values, without_effects
 from aeropend_ident.interrupt import check
 from aeropend_ident.signals.pulses import mean_speed
 from aeropend_ident.signals.signals import Signals
 from aeropend_sim.model import actuator, dynamics, sensing
-from aeropend_sim.model.coefficients import prepare
+from aeropend_sim.model.coefficients import prepare, prepare_motor
 from aeropend_sim.model.parameters import LONGEST_STEP, Model
 from aeropend_sim.model.state import State
 
 Array = NDArray[np.float64]
 Values = Mapping[str, float]
 Pieces = Sequence[tuple[slice, Model]]
-
-KEPT = 2
-"""Runs of the motor that are kept (derived: that of the point from which parameters are moved, and one moved)."""
-
 
 def free_run(model: Model, signals: Signals, values: Values | None = None) -> dict[str, Array]:
     """Simulate the rig from the duty alone and read it as the rig would, without random effects.
@@ -64,31 +60,38 @@ class StagedRun:
 
     def __init__(self, model: Model, signals: Signals) -> None:
         self.model, self.signals = model, signals
-        self._motor = lru_cache(KEPT)(self._run_motor)
+        self._motor_runs: LastRuns[_MotorRun] = LastRuns()
+        self._motions: LastRuns[tuple[Array, Array]] = LastRuns()
 
     def readings(self, values: Values) -> dict[str, Array]:
         """As `free_run`, with these values."""
         check()
         s, pieces = self.signals, _pieces(self.model, self.signals, values)
-        motor = self._motor(tuple((name, x) for name, x in values.items() if acts_on_motor(name)))
+        turning = {name: x for name, x in values.items() if acts_on_motor(name)}
+        swinging = {name: x for name, x in values.items() if acts_on_arm(name)}
+        motor = self._motor_runs.of(turning, lambda: self._turn(turning))
+        theta, theta_dot = self._motions.of(swinging, lambda: self._swing(swinging, motor.speed))
+        return _read(theta, theta_dot, motor.i_a, motor.v_a, motor.held_speed, s, pieces)
+
+    def _swing(self, values: Values, speeds: Sequence[Array]) -> tuple[Array, Array]:
+        s, pieces = self.signals, _pieces(self.model, self.signals, values)
         state = _begin(pieces, values)
         theta, theta_dot = np.empty(len(s)), np.empty(len(s))
-        for speed, (piece, m) in zip(motor.speed, pieces, strict=True):
+        for speed, (piece, m) in zip(speeds, pieces, strict=True):
             parts = len(speed) // (piece.stop - piece.start)
             angle, rate, state = dynamics.swing(m, speed, state, s.period / parts)
             theta[piece], theta_dot[piece] = angle[::parts], rate[::parts]
-        return _read(theta, theta_dot, motor.i_a, motor.v_a, motor.held_speed, s, pieces)
+        return theta, theta_dot
 
-    def _run_motor(self, values: tuple[tuple[str, float], ...]) -> _MotorRun:
-        s, own = self.signals, dict(values)
-        pieces = _pieces(self.model, s, own)
-        state, speed = _begin(pieces, own), []
+    def _turn(self, values: Values) -> _MotorRun:
+        s, pieces = self.signals, _pieces(self.model, self.signals, values)
+        state, speed = _begin(pieces, values), []
         i_a, v_a, omega, angle = np.empty((4, len(s)))
         for piece, m in pieces:
             v, sampled = _voltages(s, piece, m)
             parts = math.ceil(s.period / LONGEST_STEP - 1e-9)  # within which the speed is a straight line
             out = np.empty((3, parts * len(v)))
-            state = dynamics.run_motor(np.repeat(v, parts), state, *prepare(m, s.period / parts), out)
+            state = dynamics.run_motor(np.repeat(v, parts), state, *prepare_motor(m, s.period / parts), out)
             i_a[piece], omega[piece], angle[piece] = out[:, ::parts]
             v_a[piece] = actuator.terminal_voltage(m, sampled, i_a[piece], s.period)
             speed.append(out[1])

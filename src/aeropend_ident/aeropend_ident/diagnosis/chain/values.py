@@ -100,11 +100,21 @@ def neutral(model: Model, name: str) -> float:
 
 
 def acts_on_motor(name: str) -> bool:
-    """Whether a value acts on voltage, current or speed, rather than on the arm or on a reading alone."""
+    """Whether a value acts on voltage, current or speed, rather than on the arm or on a reading alone.
+
+    An error of the voltage's reading does: it puts off the true voltage, which is that of the reading without it.
+    """
     k = key(name)
     if k.owner in DEFINED:
-        return DEFINED[k.owner].place not in BEHIND_ROTOR
+        return DEFINED[k.owner].place not in BEHIND_ROTOR or DEFINED[k.owner].reading == "v_a"
     return k.owner != "sensing" and name not in (*STAGES["arm"], "initial.theta", "initial.theta_dot")
+
+
+def acts_on_arm(name: str) -> bool:
+    """Whether a value acts on the motion of the arm, rather than on a reading alone."""
+    owner = key(name).owner
+    read = DEFINED[owner].place == "sensing" if owner in DEFINED else owner == "sensing"
+    return not read or acts_on_motor(name)
 
 
 def limits(name: str) -> EffectParameter | ModelParameter:

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
 from aeropend_ident.estimation.map_fit import Fit
+from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter
 
 
@@ -108,7 +110,7 @@ def adopted(known: list[Parameter], hypothesis: Hypothesis, start: int = 0) -> l
 
 
 def drop_unneeded(findings: Findings, without: Callable[[Findings, Hypothesis], Fit],
-                  lost: Callable[[Findings, Fit], float], least: int = 0) -> Findings:
+                  lost: Callable[[Findings, Fit], float], least: int = 0, jobs: int = 1) -> Findings:
     """Take out effects that are not needed beside the others, the least needed first (backward elimination).
 
     Args:
@@ -116,14 +118,16 @@ def drop_unneeded(findings: Findings, without: Callable[[Findings, Hypothesis], 
         without: fits what was found without one effect.
         lost: log evidence that such a fit has less than the final fit.
         least: number of effects that stay in any case.
+        jobs: processes.
     """
     while len(findings.found) > least:
-        tried = [(selection, without(findings, selection[0].hypothesis)) for selection in findings.found]
-        needed = [lost(findings, f) + selection[0].hypothesis.log_odds for selection, f in tried]
+        effects = findings.effects
+        fits = parallel(jobs, partial(without, findings), effects)
+        needed = [lost(findings, f) + h.log_odds for h, f in zip(effects, fits, strict=True)]
         k = needed.index(min(needed))
         if needed[k] > 0.0:
             break
-        findings = findings.without(*tried[k])
+        findings = findings.without(findings.found[k], fits[k])
     return findings
 
 

@@ -186,7 +186,7 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
             findings = _with_best_set(chains, findings, nominal, candidates, jobs)
         else:
             findings = _with_best_forms(chains, _with_better_rivals(chains, findings, nominal), nominal, jobs)
-    findings = _without_unneeded(chains, findings, nominal, trifle)
+    findings = _without_unneeded(chains, findings, nominal, trifle, jobs)
     if findings.found and several and not passed(deadline):
         findings = compared(chains, findings, nominal, candidates, jobs)
     return findings
@@ -343,7 +343,8 @@ def _alike(chains: CutChains, findings: Findings, f: Fit) -> bool:
             and squared_gap(chains, findings.final) <= ALIKE * squared_gap(chains, f))
 
 
-def _without_unneeded(chains: CutChains, findings: Findings, nominal: list[Parameter], trifle: float) -> Findings:
+def _without_unneeded(chains: CutChains, findings: Findings, nominal: list[Parameter], trifle: float, jobs: int = 1
+                      ) -> Findings:
     """Take out effects that are not needed beside the others, and those that close no more than a trifle."""
     def without(now: Findings, h: Hypothesis) -> Fit:
         return fit(chains.residuals(now.stage), started(_beside(now, nominal, h), now.final.values))
@@ -354,7 +355,7 @@ def _without_unneeded(chains: CutChains, findings: Findings, nominal: list[Param
             return closes - UNNEEDED
         return now.final.evidence_over(f)
 
-    return drop_unneeded(findings, without, lost, least=1)
+    return drop_unneeded(findings, without, lost, 1, jobs)
 
 
 def refit(chains: CutChains, stage: str, effects: Sequence[Hypothesis], start: Mapping[str, float],
