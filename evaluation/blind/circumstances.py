@@ -302,7 +302,7 @@ class Judged:
     @property
     def listed(self) -> bool:
         """Whether each effect in it is claimed, or listed as small."""
-        return all(key in self.answer.found or score.id_of(key) in self.answer.small for key in self.keys)
+        return score.listed(self.keys, self.answer)
 
     @property
     def material(self) -> set[str]:

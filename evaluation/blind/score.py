@@ -272,6 +272,11 @@ def both(t: Label, a: Answer) -> bool:
     return right_first(t, a) and t.keys <= set(a.found)
 
 
+def listed(keys: Iterable[str], a: Answer) -> bool:
+    """Whether each effect is claimed, or listed as small."""
+    return all(key in a.found or id_of(key) in a.small for key in keys)
+
+
 def by_effect(pairs: Pairs) -> dict[str, list[tuple[Label, Answer]]]:
     """Recordings of a single effect by its id."""
     groups: dict[str, list[tuple[Label, Answer]]] = {}
@@ -332,9 +337,10 @@ def scored(pairs: Pairs) -> list[Figure]:
 
 
 def besides(pairs: Pairs) -> list[Figure]:
-    """Effects claimed besides the true ones; reported without a target."""
+    """Effects claimed besides the true ones, or listed as small; reported without a target."""
     single, two = of_kind(pairs, "single"), of_kind(pairs, "two")
     return [share("single: something claimed besides", [bool(set(a.found) - t.keys) for t, a in single]),
+            share("both of two, or one of them listed as small", [listed(t.keys, a) for t, a in two]),
             share("both of two and nothing besides", [both(t, a) and set(a.found) == t.keys for t, a in two])]
 
 
