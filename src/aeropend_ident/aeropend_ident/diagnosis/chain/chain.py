@@ -79,9 +79,10 @@ class CutChain:
     actuator_values: dict[str, float] = field(default_factory=dict)
     unexplained_voltage: Array = field(default_factory=lambda: np.zeros(0))
     _last: tuple[Values, Model] | None = field(default=None, init=False, repr=False, compare=False)
-    _motor_runs: LastRuns[tuple[Array, Array, Array]] = field(default_factory=LastRuns, init=False, repr=False,
-                                                              compare=False)
-    _motions: LastRuns[tuple[Array, Array]] = field(default_factory=LastRuns, init=False, repr=False, compare=False)
+    _motor_runs: LastRuns[tuple[Array, Array, Array]] = field(default_factory=lambda: LastRuns(acts_on_motor),
+                                                              init=False, repr=False, compare=False)
+    _motions: LastRuns[tuple[Array, Array]] = field(default_factory=lambda: LastRuns(acts_on_arm),
+                                                    init=False, repr=False, compare=False)
 
     @classmethod
     def cut(cls, model: Model, signals: Signals) -> CutChain:
@@ -185,8 +186,7 @@ class CutChain:
             [A] current, [rad/s] speed and [rad] rotor angle, (N,) each; NaN of values with which no motor is so fast.
             They are kept, and must not be changed.
         """
-        acting = {name: x for name, x in values.items() if acts_on_motor(name)}
-        return self._motor_runs.of((stop, acting), lambda: self._turn(values, stop))
+        return self._motor_runs.of(values, lambda _: self._turn(values, stop), stop)  # the model of all is at hand
 
     def _turn(self, values: Values, stop: int | None) -> tuple[Array, Array, Array]:
         first = float(self.signals.i_a[0]) if np.isfinite(self.signals.i_a[0]) else 0.0
@@ -226,8 +226,8 @@ class CutChain:
         """Set the arm's input to the measured speed, described by the motor with these values."""
         s = self.signals
         _, omega, angle = self.motor(values)
-        omega = omega.copy()
         if s.pulses is not None and (~s.pulses.false).sum() > 2:
+            omega = omega.copy()
             p = s.pulses.of(~s.pulses.false)
             error = p.omega - mean_speed(angle, p.time, p.period, s.period)
             t, middle = s.time, p.time - 0.5 * p.period
@@ -252,8 +252,7 @@ class CutChain:
 
     def arm_motion(self, values: Values, stop: int | None = None) -> tuple[Array, Array]:
         """True angle [rad] and angular rate [rad/s], (N,) each; arguments, and what is kept, as for `motor`."""
-        acting = {name: x for name, x in values.items() if acts_on_arm(name)}
-        return self._motions.of((stop, acting), lambda: self._swing(values, stop))
+        return self._motions.of(values, lambda _: self._swing(values, stop), stop)
 
     def _swing(self, values: Values, stop: int | None) -> tuple[Array, Array]:
         s, pieces = self.signals, self.pieces(values, stop)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
-from aeropend_ident.diagnosis.chain.counted_chains import CountedChains
+from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import (
     CHOSEN,
     FINDINGS,
@@ -207,7 +207,7 @@ def without_findings(rig: DrivenRig, given: Model, recordings: Sequence[Signals]
 def _unseen(model: Model, recordings: Sequence[Signals], state: Mapping[str, float]) -> float:
     """Sum of squares, in units of a reading's noise, of free runs over the parts that nothing was fitted to."""
     values = fit_own(model, recordings, state=state).values
-    chains = CountedChains(model, recordings, UNCALIBRATED)
+    chains = CutChains(model, recordings, UNCALIBRATED)
     total = 0.0
     for k, (chain, s) in enumerate(zip(chains.each, recordings, strict=True)):
         off = (chain.arm(chains.values_of(values, k)) - s.theta)[s.train:] / s.sigma["theta"]
@@ -352,7 +352,7 @@ def _fitted(model: Model, recordings: Sequence[Signals], rounds: int, steps: int
 def fit_own(model: Model, recordings: Sequence[Signals], rounds: int = LAST_ROUNDS, steps: int = LAST_STEPS,
             deadline: float | None = None, state: Mapping[str, float] | None = None) -> Fit:
     """Fit the parameters of a nominal model, with those of the effects that it holds, from initial states."""
-    chains = CountedChains(model, recordings, UNCALIBRATED)
+    chains = CutChains(model, recordings, UNCALIBRATED)
     chains.state = state or {}
     return fit(chains.residuals("arm"), nominal_parameters(chains, "arm"), rounds, steps, UNCALIBRATED.least_ess,
                deadline)

@@ -60,21 +60,19 @@ class StagedRun:
 
     def __init__(self, model: Model, signals: Signals) -> None:
         self.model, self.signals = model, signals
-        self._motor_runs: LastRuns[_MotorRun] = LastRuns()
-        self._motions: LastRuns[tuple[Array, Array]] = LastRuns()
+        self._motor_runs: LastRuns[_MotorRun] = LastRuns(acts_on_motor)
+        self._motions: LastRuns[tuple[Array, Array]] = LastRuns(acts_on_arm)
 
     def readings(self, values: Values) -> dict[str, Array]:
         """As `free_run`, with these values."""
         check()
         s, pieces = self.signals, _pieces(self.model, self.signals, values)
-        turning = {name: x for name, x in values.items() if acts_on_motor(name)}
-        swinging = {name: x for name, x in values.items() if acts_on_arm(name)}
-        motor = self._motor_runs.of(turning, lambda: self._turn(turning))
-        theta, theta_dot = self._motions.of(swinging, lambda: self._swing(swinging, motor.speed))
+        motor = self._motor_runs.of(values, self._turn)
+        theta, theta_dot = self._motions.of(values, lambda own: self._swing(pieces, own, motor.speed))
         return _read(theta, theta_dot, motor.i_a, motor.v_a, motor.held_speed, s, pieces)
 
-    def _swing(self, values: Values, speeds: Sequence[Array]) -> tuple[Array, Array]:
-        s, pieces = self.signals, _pieces(self.model, self.signals, values)
+    def _swing(self, pieces: Pieces, values: Values, speeds: Sequence[Array]) -> tuple[Array, Array]:
+        s = self.signals
         state = _begin(pieces, values)
         theta, theta_dot = np.empty(len(s)), np.empty(len(s))
         for speed, (piece, m) in zip(speeds, pieces, strict=True):

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
+from aeropend_ident.diagnosis.chain.values import Values
+
 Run = TypeVar("Run")
 
 KEPT = 4
@@ -16,20 +18,28 @@ KEPT = 4
 
 
 class LastRuns(Generic[Run]):
-    """The last runs of a part of the chain, each with what acted on it."""
+    """The last runs of a part of the chain, each with what acted on it.
 
-    def __init__(self) -> None:
+    Args:
+        acts: whether a value acts on this part, by its name.
+    """
+
+    def __init__(self, acts: Callable[[str], bool]) -> None:
+        self._acts = acts
         self._kept: list[tuple[object, Run]] = []
 
-    def of(self, acting: object, run: Callable[[], Run]) -> Run:
-        """The run under what acts, which is made if it is none of the last.
+    def of(self, values: Values, run: Callable[[Values], Run], stop: int | None = None) -> Run:
+        """The run with some values, which is made if it is none of the last.
 
         Args:
-            acting: values and whatever else the run depends on.
-            run: makes it. What it returns is kept, and must not be changed.
+            values: of all parts, by name.
+            run: makes it from those that act. What it returns is kept, and must not be changed.
+            stop: sample at which the run stops; None: the end.
         """
+        own = {name: x for name, x in values.items() if self._acts(name)}
+        acting = stop, own
         k = next((k for k, (other, _) in enumerate(self._kept) if other == acting), -1)
-        found = self._kept.pop(k) if k >= 0 else (acting, run())
+        found = self._kept.pop(k) if k >= 0 else (acting, run(own))
         self._kept.append(found)
         del self._kept[:-KEPT]
         return found[1]

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from aeropend_ident.bags.reading import RecordingError
 from aeropend_ident.diagnosis.chain.chain import SHORTEST_STEP, CutChain, CutChains
-from aeropend_ident.diagnosis.chain.counted_chains import CountedChains
 from aeropend_ident.diagnosis.chain.driven_rig import fit_driven_rig
 from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.chain.values import STAGES, of_rig
@@ -266,7 +265,7 @@ def _over_growing_horizons(model: Model, recordings: Sequence[Signals], deadline
     for share in HORIZONS:
         least = round(SHORTEST_HORIZON / recordings[0].period)
         part = [replace(s, train=min(max(round(share * s.train), least), s.train)) for s in recordings]
-        chains = CountedChains(model, part, policy_of(part, fit_nominal=True))
+        chains = CutChains(model, part, policy_of(part, fit_nominal=True))
         f = fit(chains.residuals("arm"), nominal_parameters(chains, "arm"), ROUNDS, deadline=deadline)
         model = chains.each[0].valued(of_rig(f.values))
     return model, f
