@@ -221,13 +221,25 @@ def test_the_readme_is_one_page():
 
 @pytest.mark.promise("Measurements", "The figures of the README are those of the results")
 def test_figures_of_the_readme_are_those_of_the_results():
-    results = (ROOT / "docs" / "results" / "blind.md").read_text(encoding="utf-8")
-    measured = [float(number) for number in re.findall(r"\d+(?:\.\d+)?", results)]
+    results = [(ROOT / "docs" / "results" / f"{page}.md").read_text(encoding="utf-8")
+               for page in ("blind", "circumstances", "real")]
+    measured = [float(number) for number in re.findall(r"\d+(?:\.\d+)?", "".join(results))]
     trust = README.partition("## How far to trust it\n")[2].partition("\n## ")[0]
     shown = re.findall(r"(?<![\w.])\d+(?:\.\d+)?", trust)
     assert len(shown) > 12
     assert [number for number in shown
             if float(number) not in [round(one, len(number.partition(".")[2])) for one in measured]] == []
+
+
+@pytest.mark.promise("Measurements", "The index of the results has the date and the commit of each page")
+def test_the_index_of_the_results_has_date_and_commit_of_each_page():
+    folder = ROOT / "docs" / "results"
+    rows = dict(re.findall(r"^\| \[([\w.]+)\]\([\w.]+\) \|.*?\| ([-\d]+ \| \w+) \|$",
+                           (folder / "README.md").read_text(encoding="utf-8"), re.MULTILINE))
+    assert set(rows) == {path.name for path in folder.glob("*.md")} - {"README.md"}
+    for name, row in rows.items():
+        said = re.search(r"Measured on ([-\d]+)[^.]*?commit (\w+)", (folder / name).read_text(encoding="utf-8"))
+        assert said is None or row == " | ".join(said.groups()), name
 
 
 @pytest.mark.promise("Packages", "A script of the guide runs")

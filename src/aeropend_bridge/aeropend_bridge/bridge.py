@@ -64,7 +64,7 @@ USAGE = usage(
     [
         "bridge",
         "bridge --ros-args -p port:=/dev/ttyACM1 -p scheme:=ssi",
-        "bridge --ros-args --params-file my_rig.yaml       (from `calibrate my_rig.yaml`)",
+        "bridge --ros-args --params-file my_calibration.yaml       (from `calibrate my_calibration.yaml`)",
     ],
     "  flash the board with `make -C firmware flash`; wiring in firmware/README.md",
 )

@@ -36,9 +36,9 @@ BAD_ANGLES = 0.01
 COUNTS = 1024
 
 EXAMPLES = f"""examples, with the arm hanging still and no bridge running:
-  calibrate my_rig.yaml
-  calibrate my_rig.yaml --port /dev/ttyACM1 --seconds 10
-  bridge --ros-args --params-file my_rig.yaml      use the calibration
+  calibrate my_calibration.yaml
+  calibrate my_calibration.yaml --port /dev/ttyACM1 --seconds 10
+  bridge --ros-args --params-file my_calibration.yaml      use the calibration
 
 {EXIT_CODES}"""
 
