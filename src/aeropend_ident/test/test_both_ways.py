@@ -91,6 +91,17 @@ def test_a_rig_that_nobody_calibrated_is_identified_both_ways_by_a_speed_with_a_
     assert_friction(conclusions)
 
 
+@pytest.mark.parametrize("held", [True, False])
+def test_a_speed_with_a_sign_is_held_from_pulse_to_pulse_or_sampled(held):
+    """A driver may give the speed of the pulses the sign of its command."""
+    read, truth = rig.record(off(LINEAR, 3).with_effects({"coulomb_friction": {"accel": FRICTION}}), DUTY, 5)
+    speed = np.copysign(read["omega"], truth["omega"]) if held else truth["omega"]
+    s, conclusions = found({**read, "omega": speed}, ("duty", "i_a", "v_a", "omega"), LINEAR)
+    assert (s.pulses is not None) is held
+    assert any("omega goes below 0 and is not held" in note for note in s.notes) is not held
+    assert_friction(conclusions)
+
+
 def test_a_duty_below_0_brakes_where_the_model_does_not_reverse(driven):
     one_way = from_flat({"model.reverse": 0.0}, base=LINEAR)
     s = as_signals(recording(T, driven["theta"], DUTY, v_a=driven["v_a"]), one_way)

@@ -53,6 +53,18 @@ def test_a_rule_is_broken_where_its_condition_holds(rule, document, broken):
     assert outcome.broken is broken, outcome
 
 
+@pytest.mark.parametrize(("rule", "found"), [("parameter_mismatch>15%", "it is 10 %"), ("share>15%", "it is 10 %"),
+                                             ("parameter_mismatch", "it is claimed, with 10 % of the gap")])
+def test_shares_are_those_of_what_is_claimed(rule, found):
+    """Of two parameters that are claimed, beside one that was a rival and has no share."""
+    claimed, rival = (Candidate("parameter_mismatch", "arm", 0.9, {}, was, 0.02, share)
+                      for was, share in ((True, Interval(0.05, 0.04, 0.06)), (False, None)))
+    document = replace(FOUND, which=replace(FOUND.which, effects=("parameter_mismatch",),
+                                            candidates=(claimed, claimed, rival)))
+    (outcome,) = checks.check(document, [checks.parse(rule)])
+    assert outcome.found == found
+
+
 @pytest.mark.parametrize(("rule", "words"), [
     ("gap", "compare it with a number"), ("gap>", "not a rule"), ("gap>1e", "not a number"),
     ("gapp>1", "did you mean gap?"), ("coulomb_frictio", "did you mean coulomb_friction?"),

@@ -7,10 +7,11 @@ import pytest
 
 from aeropend_ident.design.responses import asked
 from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.document import Since
 from aeropend_ident.diagnosis.left_open import as_refitted, design_command, left_open
 from aeropend_ident.diagnosis.results import document, verdict_lines
 from aeropend_ident.signals.signals import from_arrays
-from aeropend_sim.model import rig
+from aeropend_sim.model import effect_file, rig
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, load
 
@@ -40,6 +41,22 @@ def test_where_nothing_is_open_nothing_is_asked(lag):
     closed = replace(lag, which=replace(lag.which, not_separable=()))
     assert left_open(closed).names == ()
     assert design_command(closed) == ""
+
+
+def test_no_command_is_given_for_a_rig_without_a_model_file_or_an_effect_of_a_file(lag):
+    """After --since the model is that of an earlier verdict; `design` knows the effects of the catalogue."""
+    assert design_command(replace(lag, since=Since(("monday",), (), {}, ()))) == ""
+    row = next(c for c in lag.which.candidates if c.effect == "encoder_lag")
+    others = [c for c in lag.which.candidates if c.effect != "encoder_lag"]
+    of_a_file = replace(lag.which, not_separable=(("thrust_lag", "my_hose"),),
+                        candidates=(*others, replace(row, effect="my_hose")))
+    effect_file.define({"my_hose": {"place": "arm", "physics": "a hose", "term": "-k * theta", "parameters": {
+        "k": {"unit": "1/s²", "default": 1.0, "low": 0.0, "high": 9.0}}}}, "here")
+    try:
+        assert set(left_open(replace(lag, which=of_a_file)).names) == {"thrust_lag", "my_hose"}
+        assert design_command(replace(lag, which=of_a_file)) == ""
+    finally:
+        effect_file.forget("my_hose")
 
 
 def test_an_experiment_is_designed_for_a_rig_that_has_what_is_sure():

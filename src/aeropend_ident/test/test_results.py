@@ -6,16 +6,22 @@ import math
 import pytest
 
 from aeropend_ident.diagnosis.document import (
+    FORMAT,
     Candidate,
     ClosedGap,
+    Closure,
+    DiagnosisDocument,
     HangingAngle,
     Identified,
     Interval,
     Lift,
     NextExperiment,
     ParameterRow,
+    Where,
+    Which,
 )
-from aeropend_ident.diagnosis.results import describe, experiment, gap_line, identified_line
+from aeropend_ident.diagnosis.results import describe, experiment, gap_line, identified_line, verdict_lines
+from aeropend_ident.diagnosis.typed_json import from_json, schema
 
 
 @pytest.mark.parametrize(("closed", "low", "high", "text"), [
@@ -60,3 +66,21 @@ def test_the_line_of_an_uncalibrated_rig():
     assert identified_line(Identified("the angle", (), slow), {}, 60.0) == (
         "identified from the angle: lift up to 20.0 rad/s² at a duty of 0.90, with a lag longer than the recording")
     assert identified_line(Identified("the angle", ()), {}) == "identified from the angle: nothing"
+
+
+def test_each_parameter_that_is_claimed_has_its_line():
+    share = Interval(0.4, 0.3, 0.5)
+    rows = [Candidate("parameter_mismatch", "electrical", 0.99, {n: Interval(x, x, x)}, found, 0.1, share)
+            for n, x, found in (("R_a", 1.5, True), ("L_a", 0.01, False), ("c_over_J", 2.0, True))]
+    lines = verdict_lines(DiagnosisDocument(
+        format=FORMAT, bags=("bag",), model="bench", duration_s=70.0, samples=1000, train_s=(0.0, 49.0),
+        held_out_s=(49.0, 70.0), channels={}, where=Where("electrical", {}, ()),
+        which=Which("parameter_mismatch", ("parameter_mismatch",), tuple(rows), {}, {}, (), None, (), None),
+        closure=Closure(0.2, 0.02, 0.01, 0.9, None, None), notes=(), seconds=1.0))
+    assert [line.split(" = ")[0] for line in lines if "parameter_mismatch: " in line] == [
+        "  parameter_mismatch: R_a", "  parameter_mismatch: c_over_J"]
+
+
+def test_a_verdict_of_before_a_key_was_added_is_read():
+    assert from_json(Identified, {"from": "the angle", "not_determined": []}) == Identified("the angle", ())
+    assert schema(Identified)["required"] == ["from", "not_determined"]

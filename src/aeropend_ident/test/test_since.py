@@ -9,7 +9,7 @@ import pytest
 
 from aeropend_ident.commands import diagnose as command
 from aeropend_ident.diagnosis import since
-from aeropend_ident.diagnosis.chain.known import Known, pooled
+from aeropend_ident.diagnosis.chain.known import Known, pooled, stage_of
 from aeropend_ident.diagnosis.diagnosis import Diagnosis, diagnose
 from aeropend_ident.diagnosis.document import DocumentError
 from aeropend_ident.diagnosis.report import changes
@@ -19,7 +19,7 @@ from aeropend_ident.estimation.parameter import Parameter, prior_information
 from aeropend_ident.signals.signals import Signals, from_arrays
 from aeropend_ident.testing import bags
 from aeropend_ident.testing.rigs import BENCH, drawn_rig, steps
-from aeropend_sim.model import rig
+from aeropend_sim.model import effect_file, rig
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 
 FRICTION = 0.5
@@ -107,6 +107,20 @@ def test_a_verdict_that_leaves_parameters_undetermined_can_be_compared_with(tmp_
     _, known, (verdict,) = since.read([tmp_path / "monday"])
     assert "k2" in verdict.identified.not_determined
     assert (known.covariance == known.covariance.T).all()
+
+
+@pytest.mark.parametrize(("reading", "built_in", "stage"), [
+    ("v_a", "voltage_offset.bias", "actuator"), ("i_a", "current_gain.gain", "motor"),
+    ("theta", "angle_offset.bias", "arm")])
+def test_what_a_reading_gets_by_formula_has_the_stage_of_that_reading(reading, built_in, stage):
+    id_ = f"test_since_{reading}"
+    effect_file.define({id_: {"place": "sensing", "reading": reading, "physics": "an error", "term": "bias",
+                              "parameters": {"bias": {"unit": effect_file.unit_of("sensing", reading), "default": 0.1,
+                                                      "low": -1.0, "high": 1.0}}}}, "here")
+    try:
+        assert stage_of(f"{id_}.bias") == stage_of(built_in) == stage
+    finally:
+        effect_file.forget(id_)
 
 
 def test_a_product_is_known_although_its_factors_are_not(monday):

@@ -123,7 +123,10 @@ def _of(document: DiagnosisDocument, rule: Rule) -> tuple[str, bool]:
         more = {"not_separable": ", ".join(" and ".join(pair) for pair in which.not_separable),
                 "not_determined": ", ".join(document.identified.not_determined) if document.identified else ""}
         return more.get(rule.name) or f"the verdict is {which.verdict}", states[rule.name]
-    shares = {c.effect: c.share.value if c.share else 1.0 for c in which.candidates if c.effect in which.effects}
+    shares: dict[str, float] = {}
+    for c in which.candidates:
+        if c.found:
+            shares[c.effect] = shares.get(c.effect, 0.0) + (c.share.value if c.share else 1.0)
     if rule.name in NUMBERS:
         runs = (document.closure, *document.closure.across)
         values = {"gap": [run.gap for run in runs], "gap_after": [run.gap_after for run in runs],

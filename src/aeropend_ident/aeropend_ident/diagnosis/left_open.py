@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from aeropend_ident.diagnosis.document import Candidate, DiagnosisDocument
+from aeropend_sim.model.effect_file import BUILT_IN
 from aeropend_sim.model.effects import DEFINED, PARAMETER_MISMATCH, RANDOM
 from aeropend_sim.model.parameters import Model
 
@@ -72,13 +73,18 @@ def as_refitted(model: Model, document: DiagnosisDocument) -> Model:
 def design_command(document: DiagnosisDocument) -> str:
     """The command that designs an experiment for what a verdict leaves open; "" if nothing is, or no signal helps.
 
-    An uncalibrated rig has no model file with which an experiment could be designed.
+    An uncalibrated rig has no model file with which an experiment could be designed, nor has a rig that was compared
+    with earlier verdicts. An effect of a file is not known to the command.
 
     Args:
         document: of the diagnosis.
     """
     names, advice = left_open(document).names, document.which.next_experiment
-    if document.identified is not None or not names or advice is None or not advice.excite:
+    if document.identified is not None or document.since is not None:
+        return ""
+    if not names or advice is None or not advice.excite:
+        return ""
+    if not {name.partition(":")[0] for name in names} <= BUILT_IN | {PARAMETER_MISMATCH}:
         return ""
     return shlex.join(["design", "--model", document.model, "--separate", *names])
 

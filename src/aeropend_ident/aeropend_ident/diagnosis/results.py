@@ -198,8 +198,8 @@ def verdict_lines(document: DiagnosisDocument, *, advice: bool = True) -> list[s
         lines.append(f"verdict: {enumerated(which.effects)} ({document.where.place}){left}")
     if which.verdict != CANNOT_TELL and (failed := sentence.failed(document)):
         lines.append(f"warning: {failed}")
-    found = {c.effect: c for c in reversed(which.candidates)}
-    lines += [f"  {effect}: {describe(found[effect])}" for effect in which.effects if effect in found]
+    lines += [f"  {c.effect}: {describe(c)}" for effect in which.effects for c in which.candidates
+              if c.found and c.effect == effect]
     small = [f"{c.effect}, {of_the_gap(c.share)}" for c in which.candidates if c.share and not c.found]
     if small:
         lines.append(f"  not claimed: {'; '.join(small)}")

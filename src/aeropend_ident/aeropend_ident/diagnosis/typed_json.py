@@ -33,7 +33,7 @@ def to_json(value: object) -> Any:
     """The value as dicts, lists and scalars."""
     if is_dataclass(value):
         pairs = [(f, getattr(value, f.name)) for f in fields(value)]
-        return {_key(f): to_json(x) for f, x in pairs if f.default is MISSING or x != f.default}
+        return {_key(f): to_json(x) for f, x in pairs if _required(f) or x != _default(f)}
     if isinstance(value, Mapping):
         return {key: to_json(x) for key, x in value.items()}
     return [to_json(x) for x in value] if isinstance(value, (list, tuple)) else value
@@ -93,9 +93,17 @@ def _read_object(kind: Any, data: object, path: str) -> Any:
     for f in fields(kind):
         if _key(f) in found:
             values[f.name] = _read(hints[f.name], found[_key(f)], _below(path, _key(f)))
-        elif f.default is MISSING:
+        elif _required(f):
             raise JsonError(f"{_below(path, _key(f))} is missing")
     return kind(**values)
+
+
+def _required(f: Field[Any]) -> bool:
+    return f.default is MISSING and f.default_factory is MISSING
+
+
+def _default(f: Field[Any]) -> object:
+    return f.default if f.default_factory is MISSING else f.default_factory()
 
 
 def _read_union(members: tuple[Any, ...], data: object, path: str) -> Any:
@@ -158,7 +166,7 @@ def _schema_of_object(kind: Any, definitions: dict[str, object]) -> dict[str, ob
             members = [m for m in get_args(hints[f.name]) if m is not types.NoneType]
         properties[_key(f)] = {**described, **_any_of(members, definitions)}
     return {"description": (kind.__doc__ or "").partition("\n")[0], "type": "object", "properties": properties,
-            "required": [_key(f) for f in fields(kind) if f.default is MISSING]}
+            "required": [_key(f) for f in fields(kind) if _required(f)]}
 
 
 def _descriptions(kind: Any) -> dict[str, str]:

@@ -88,7 +88,7 @@ def stages_of(effect: str) -> tuple[str, ...]:
     """
     e = DEFINED[effect]
     if e.place == "sensing":
-        return {"v_a": ("actuator", "motor"), "i_a": ("motor",)}.get(e.reading, ("arm",))
+        return {"v_a": ("actuator", "motor"), "i_a": ("motor",), "omega": ("motor",), "theta": ("arm",)}[e.reading]
     return {"actuator": ("actuator",), "electrical": ("motor",), "rotor": ("motor",)}.get(e.place, ("arm",))
 
 

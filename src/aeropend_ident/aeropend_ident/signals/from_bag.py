@@ -118,6 +118,12 @@ def as_signals(read: Recording, model: Model, held_out: float = 0.3, *, fit_nomi
         read = replace(read, theta=theta, notes=(*read.notes, said))
     if float(np.nanmin(read.duty, initial=0.0)) < -STILL:
         read = _driven_backward(read, reverses=fit_nominal or model.model["reverse"] > 0.0)
+    sense, slowest = model.sensing, float(np.nanmin(read.omega, initial=0.0))
+    if slowest < 0.0 < sense["speed_pulses_per_rev"] and not _held_by_pulses(read, sense):
+        sense = {**sense, "speed_pulses_per_rev": 0.0}
+        said = ("omega goes below 0 and is not held from pulse to pulse: taken as sampled, as with "
+                "speed_pulses_per_rev: 0")
+        read = replace(read, notes=(*read.notes, said))
     if read.period > SLOWEST:
         raise RecordingError(f"{read.path}: its samples are {read.period:.3g} s apart, which shows no swing of an arm; "
                              "record 20 or more a second")
@@ -126,7 +132,7 @@ def as_signals(read: Recording, model: Model, held_out: float = 0.3, *, fit_nomi
         piece = longest_piece(with_voltage_as_command(read, model.model["v_full"]) if model.model["v_full"] else read)
         if not np.isfinite(piece.duty).any() and (why := _noted(read, recording.NO_DUTY)) is not None:
             raise RecordingError(f"{read.path}: no duty: {why}")
-        return from_recording(checked(piece, model, mounting), model.sensing, held_out)
+        return from_recording(checked(piece, model, mounting), sense, held_out)
     piece = longest_piece(read)
     if len(piece) < FEWEST:
         raise RecordingError(f"{read.path}: {counted(len(piece), 'sample')} without a pause "
@@ -135,7 +141,7 @@ def as_signals(read: Recording, model: Model, held_out: float = 0.3, *, fit_nomi
     piece = with_voltage_as_command(piece)
     likely = mistakes.without_model(piece.theta, piece.duty, piece.i_a, piece.v_a)
     piece = replace(piece, notes=(*piece.notes, *(named(mistakes.said([one]), read.path) for one in likely)))
-    return from_uncalibrated(piece, model.sensing, held_out)
+    return from_uncalibrated(piece, sense, held_out)
 
 
 def checked(read: Recording, model: Model, mounting: Mounting | None = None) -> Recording:
@@ -396,13 +402,17 @@ def _reading_noise(t: Array, x: Array) -> float:
 def _own_sensing(read: Recording, sensing: Mapping[str, float]) -> dict[str, float]:
     """The measurement chain as the recording shows it; pulses only if the speed is held as pulses would hold it."""
     own = {**sensing, **{f"{c}_{what}": 0.0 for c in ("angle", "current", "voltage") for what in ("lsb", "noise")}}
-    pulses = sensing["speed_pulses_per_rev"]
-    speed = read.omega[np.isfinite(read.omega)]
-    if pulses > 0.0 and len(speed) > 10:
-        changes = np.flatnonzero(np.diff(speed)) + 1
-        held = np.diff(changes) * read.period
-        turn = 2.0 * math.pi / pulses / np.maximum(np.abs(speed[changes[1:]]), 1e-3)
-        fits = np.abs(held - turn) <= 1.5 * read.period
-        if len(held) < 5 or np.mean(fits) < 0.7 or np.median(held) < 2.5 * read.period:
-            own["speed_pulses_per_rev"] = 0.0
+    known = np.isfinite(read.omega).sum() > 10
+    if sensing["speed_pulses_per_rev"] > 0.0 and known and not _held_by_pulses(read, sensing):
+        own["speed_pulses_per_rev"] = 0.0
     return own
+
+
+def _held_by_pulses(read: Recording, sensing: Mapping[str, float]) -> bool:
+    """Whether the readings of the speed are held for as long as pulses of that speed would hold them."""
+    speed = read.omega[np.isfinite(read.omega)]
+    changes = np.flatnonzero(np.diff(speed)) + 1
+    held = np.diff(changes) * read.period
+    turn = 2.0 * math.pi / sensing["speed_pulses_per_rev"] / np.maximum(np.abs(speed[changes[1:]]), 1e-3)
+    fits = np.abs(held - turn) <= 1.5 * read.period
+    return len(held) >= 5 and bool(np.mean(fits) >= 0.7) and bool(np.median(held) >= 2.5 * read.period)

@@ -40,7 +40,7 @@ class Pulses:
         index: (M,) sample in which the new speed first shows.
         time: [s] (M,) estimated end of the interval; at most one sample before `index`.
         period: [s] (M,) length.
-        omega: [rad/s] (M,) mean speed over the interval.
+        omega: [rad/s] (M,) mean speed over the interval, with a sign if the readings have one.
         sigma: [rad/s] (M,) standard deviation of that mean, from the timing.
         false: (M,) true for a false capture: the length does not fit the time since the pulse before.
     """
@@ -59,7 +59,7 @@ class Pulses:
     @property
     def sure(self) -> NDArray[np.bool_]:
         """(M,) true for an interval whose length is known."""
-        return self.sigma < UNSURE * self.omega
+        return self.sigma < UNSURE * np.abs(self.omega)
 
     def then(self, others: Pulses) -> Pulses:
         """These intervals, followed by others."""
@@ -100,7 +100,7 @@ def find_pulses(omega: Array, period: float, sensing: Mapping[str, float]) -> Pu
     """Recover the intervals between pulses from a held speed.
 
     Args:
-        omega: [rad/s] (N,) held speed, NaN where missing.
+        omega: [rad/s] (N,) held speed, NaN where missing; a pulse has no direction, so that a sign is the driver's.
         period: [s] between samples.
         sensing: parameters of the measurement chain (`speed_pulses_per_rev`, `speed_tick`, `speed_noise`).
 
@@ -108,10 +108,12 @@ def find_pulses(omega: Array, period: float, sensing: Mapping[str, float]) -> Pu
         The intervals that began within the recording.
     """
     turn = 2.0 * math.pi / sensing["speed_pulses_per_rev"]
-    held = hold(omega)
-    changes = np.flatnonzero(np.diff(held) != 0.0) + 1
+    signed = hold(omega)
+    held = np.abs(signed)
+    changes = np.flatnonzero(np.diff(held) != 0.0) + 1  # a sign that changes alone is no pulse
     at = changes[held[changes] > 0.0]
-    speed = held[at]
+    speed, way = held[at], np.sign(signed[at])
+    turned = np.diff(way, prepend=way[:1]) != 0.0  # the rotor turned round in this interval: its length tells no speed
     length = turn / speed if len(at) else np.zeros(0)
     elapsed = np.diff(at, prepend=-(10**9)) * period
     stopped = np.zeros(len(at), dtype=bool)  # the speed read 0 before this interval showed
@@ -124,7 +126,10 @@ def find_pulses(omega: Array, period: float, sensing: Mapping[str, float]) -> Pu
     starts_anew = stopped & (length < SPEED_TIMEOUT)
     after = np.append(speed, [np.inf, np.inf])
     before = np.where(starts_anew & (after[2:] > after[1:-1]), 0.0, np.append(held[:1], speed)[: len(at)])
-    alone = speed > PEAK * np.maximum(before, after[1:-1])
+    beside = turned.copy()  # an interval in which the rotor turned round is no measure for its neighbours
+    beside[1:] |= turned[:-1]
+    beside[:-1] |= turned[1:]
+    alone = (speed > PEAK * np.maximum(before, after[1:-1])) & ~beside
     false = alone.copy()
     for j in range(1, len(at)):
         if not false[j - 1]:
@@ -132,19 +137,19 @@ def find_pulses(omega: Array, period: float, sensing: Mapping[str, float]) -> Pu
             passed[j] += max(round((elapsed[j] - length[j]) / length[j - 1]), 0) * length[j - 1]
         late = (1.01 + unseen[j] + unseen[j - 1]) * period + 2.0 * sensing["speed_tick"]
         fits = abs(elapsed[j] - passed[j]) <= late
-        false[j] = alone[j] or not (fits or starts_anew[j])
-        anew[j] = not fits and not false[j]
-        if false[j] or stopped[j]:
+        false[j] = alone[j] or not (fits or starts_anew[j] or turned[j])
+        anew[j] = (turned[j] or not fits) and not false[j]
+        if false[j] or stopped[j] or turned[j]:
             passed[j] = np.inf
     time, room = _pulse_times(at, unseen, passed, period)
     room = np.hypot(room, max(period - SAMPLE_PERIOD, 0.0))  # the duty may have stepped between two samples
-    slope = np.gradient(speed, time) if len(at) > 2 else np.zeros(len(at))
+    slope = np.gradient(way * speed, time) if len(at) > 2 else np.zeros(len(at))
     tick = np.maximum(sensing["speed_tick"], 1e-6) * speed / np.maximum(length, 1e-9) if len(at) else np.zeros(0)
     sigma: Array = np.sqrt(tick**2 + sensing["speed_noise"] ** 2 + (room * slope) ** 2
                            + (CLOCK_TOLERANCE * speed) ** 2)
     sigma = np.where(anew, UNSURE * speed, sigma)
     whole = time >= length  # an interval that began before the recording cannot be simulated
-    return Pulses(at[whole], time[whole], length[whole], speed[whole], sigma[whole], false[whole])
+    return Pulses(at[whole], time[whole], length[whole], (way * speed)[whole], sigma[whole], false[whole])
 
 
 def _pulse_times(at: NDArray[np.int64], unseen: NDArray[np.int64], passed: Array, period: float

@@ -277,7 +277,7 @@ def from_arrays(columns: Mapping[str, Array], period: float, sensing: Mapping[st
     if sensing["speed_pulses_per_rev"] > 0.0 and np.isfinite(columns["omega"]).any():
         pulses = find_pulses(columns["omega"], period, sensing)
         pulses = find_pulses(columns["omega"][:train], period, sensing).then(pulses.of(pulses.index >= train))
-        pulses = replace(pulses, sigma=np.where(shaken[pulses.index], UNSURE * pulses.omega, pulses.sigma))
+        pulses = replace(pulses, sigma=np.where(shaken[pulses.index], UNSURE * np.abs(pulses.omega), pulses.sigma))
     false_speed = pulses.false_samples(n) if pulses else split_apply(
         lambda x: far_from_median(x, sigma["omega"]), columns["omega"], train)
     known = np.isfinite(columns["omega"])

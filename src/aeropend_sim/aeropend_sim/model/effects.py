@@ -69,7 +69,7 @@ class Effect:
     law: str = ""
     """The same for an effect that the source holds, if its term is a formula; numbers in it have units."""
     reading: str = ""
-    """The reading that the term is added to, for a formula at place `sensing`: `theta`, `i_a` or `v_a`."""
+    """The reading that an effect at place `sensing` changes; a formula is added to `theta`, `i_a` or `v_a`."""
     memory: str = ""
     """Name of the state that such an effect has of its own; it is 0 at the start."""
     memory_unit: str = ""
@@ -162,7 +162,7 @@ _ENTRIES = (
            law="bias", reading="theta"),
     Effect("encoder_lag", "sensing", "the angle filter is slower than in the model file, or faster (tau below 0)",
            {"tau": P("s", 0.0, 0.03, -0.5, 0.5, "time constant added to each stage of the filter")},
-           in_equations=False),
+           in_equations=False, reading="theta"),
     Effect("encoder_eccentricity", "sensing",
            "the magnet is off the axis: the reading is θ + amplitude sin(θ + phase)",
            {"amplitude": P("rad", 0.0, 0.06, 0.0, 0.5, "amplitude of the error"),
@@ -178,7 +178,8 @@ _ENTRIES = (
            {"bias": P("V", 0.0, 0.1, -3.0, 3.0, "voltage read at zero")}, in_equations=False,
            law="bias", reading="v_a"),
     Effect("speed_spikes", "sensing", "false capture periods: outliers in ω",
-           {"rate": P("1/s", 0.0, 2.0, 0.0, 100.0, "mean number of false periods per second")}, in_equations=False),
+           {"rate": P("1/s", 0.0, 2.0, 0.0, 100.0, "mean number of false periods per second")}, in_equations=False,
+           reading="omega"),
 )
 
 CATALOGUE: dict[str, Effect] = {entry.id: entry for entry in _ENTRIES}

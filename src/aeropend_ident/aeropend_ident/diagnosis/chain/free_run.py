@@ -163,5 +163,5 @@ def _held_speed(omega: Array, rotor_angle: Array, signals: Signals) -> Array:
     # where the rig reads no speed, the model has stopped too if it would have shown one pulse at most
     stopped = signals.omega == 0.0
     back = np.maximum(np.arange(len(signals)) - round(sensing.SPEED_TIMEOUT / signals.period), 0)
-    slow = rotor_angle - rotor_angle[back] < p.period[0] * p.omega[0]
+    slow = np.abs(rotor_angle - rotor_angle[back]) < p.period[0] * abs(p.omega[0])
     return np.where(stopped, np.where(slow, 0.0, omega), held)

@@ -40,9 +40,6 @@ MODEL: Equations = MappingProxyType({
 READS = {"theta": "angle", "omega": "speed", "i_a": "current", "v_a": "voltage"}
 """The variable that each channel reads."""
 
-READING = {"encoder_lag": "theta", "speed_spikes": "omega"}
-"""The reading of effects at place `sensing` whose term is no formula that is added to it."""
-
 
 def equations(channels: Collection[str]) -> dict[str, frozenset[str]]:
     """The equations of a rig with some channels measured.
@@ -60,7 +57,7 @@ def equation_of(effect: str) -> str:
         effect: its id.
     """
     e = DEFINED[effect]
-    return f"read {e.reading or READING.get(e.family, 'theta')}" if e.place == "sensing" else e.place
+    return f"read {e.reading}" if e.place == "sensing" else e.place
 
 
 def overdetermined(of: Equations) -> frozenset[str]:
