@@ -73,11 +73,15 @@ def test_help_shows_examples_and_exit_codes(name, capsys):
     assert "2 " in codes
 
 
-@pytest.mark.promise("Commands", "The command lines in all documents are valid")
+@pytest.mark.promise("Commands", "Command lines in documents that begin with `.venv/bin/` name commands, options and "
+                     "parameters that exist")
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_command_lines_of_a_document_are_understood(path, capsys):
-    """By their help: names of commands, options and parameters."""
+    """By their help: names of commands, options and parameters; and effects by formula that the document defines."""
     text = path.read_text(encoding="utf-8")
+    formulas = re.findall(r"^    (\w+):\n((?: {6}.+\n)+)", text, re.MULTILINE)
+    defined = {f"effects.{effect}.{name}" for effect, lines in formulas
+               for name in re.findall(r"^ {8}(\w+): \{unit", lines, re.MULTILINE)}
     for line in re.findall(r"^    (?:eval \"\$\()?\.venv/bin/(.+?)\)?\"?$|`\.venv/bin/([^`]+)`", text, re.MULTILINE):
         name, *words = shlex.split("".join(line), comments=True)
         if name == "python":
@@ -87,7 +91,7 @@ def test_command_lines_of_a_document_are_understood(path, capsys):
         told = set(re.findall(r"[\w.-]+", shown(COMMANDS[name], capsys)))
         parameters = [word.partition(":=")[0] for word in words if ":=" in word]
         options = [word for word in words if word.startswith("--") and word not in ("--ros-args", "--params-file")]
-        assert [one for one in [*options, *parameters] if one not in told and one not in MODEL] == [], line
+        assert [one for one in [*options, *parameters] if one not in {*told, *MODEL, *defined}] == [], line
 
 
 @pytest.mark.promise("Commands", "`aeropend` lists all commands and runs them")

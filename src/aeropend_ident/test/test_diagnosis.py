@@ -59,7 +59,7 @@ def test_a_rig_whose_numbers_are_merely_a_little_off_has_no_effect(seed):
     assert body["shrink"]["gap_after"] < 1.2 * body["shrink"]["floor"]
 
 
-@pytest.mark.promise("Verdict", "Several effects are found; the one with the largest share of the gap comes first")
+@pytest.mark.promise("Verdict", "Several effects are found; the one with the largest share comes first")
 def test_two_effects_in_different_places_are_both_found():
     body = diagnose(BENCH, [recorded(71, {"coulomb_friction": {}, "brush_drop": {}})]).body
     assert set(body["which"]["effects"]) == {"coulomb_friction", "brush_drop"}
@@ -83,7 +83,7 @@ def beside_each_other(friction, drop):
     return signals, diagnose(BENCH, [signals])
 
 
-@pytest.mark.promise("Verdict", "Several effects are found; the one with the largest share of the gap comes first")
+@pytest.mark.promise("Verdict", "Several effects are found; the one with the largest share comes first")
 @pytest.mark.parametrize(("friction", "drop", "first"), [(4.0, 0.05, "coulomb_friction"), (0.2, 0.8, "brush_drop")])
 def test_the_effect_that_opens_more_of_the_gap_comes_first(friction, drop, first):
     effects, body = ("coulomb_friction", "brush_drop"), beside_each_other(friction, drop)[1].body
@@ -94,7 +94,7 @@ def test_the_effect_that_opens_more_of_the_gap_comes_first(friction, drop, first
     assert sum(shares) == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.promise("Verdict", "An effect is claimed if its share of the gap is material; smaller ones are listed")
+@pytest.mark.promise("Verdict", "An effect is claimed if its share is material; smaller ones are listed")
 def test_an_effect_that_makes_little_of_the_gap_is_small_unless_a_person_asks_for_it():
     signals, found = beside_each_other(0.2, 0.8)
     usual, strict = found.conclusions.which, diagnose(BENCH, [signals], material=0.0).conclusions.which
@@ -187,7 +187,7 @@ def filtered(factor):
     return from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, {**BENCH.sensing, "angle_lsb": 1e-4})
 
 
-@pytest.mark.promise("Verdict", "Several effects are found; the one with the largest share of the gap comes first")
+@pytest.mark.promise("Verdict", "Several effects are found; the one with the largest share comes first")
 def test_two_effects_in_one_place_are_both_found():
     body = diagnose(BENCH, [recorded(72, {"coulomb_friction": {}, "thrust_lag": {}})]).body
     assert set(body["which"]["effects"]) == {"coulomb_friction", "thrust_lag"}

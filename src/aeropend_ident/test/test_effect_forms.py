@@ -36,7 +36,7 @@ def found_of(verdict):
     return next(c for c in found.conclusions.which.candidates if c.effect == family(form))
 
 
-@pytest.mark.promise("Verdict", "An effect that follows another law than the catalogue's is named, with its form or "
+@pytest.mark.promise("Verdict", "An effect of another form than the catalogue's is named, with its form or "
                      "those that the recording cannot separate")
 def test_an_effect_of_another_form_is_named_with_its_form(verdict):
     form, found = verdict

@@ -42,7 +42,7 @@ def verdict(request):
 
 
 @pytest.mark.promise("Verdict", "Where the verdict is `unknown`, the missing term is learned at its place, and its "
-                     "share of the gap on unseen data is told")
+                     "share of the squared gap on unseen data is told")
 def test_an_effect_outside_of_the_catalogue_is_learned_at_its_place(verdict):
     id_, found = verdict
     which, closure = found.conclusions.which, found.conclusions.closure
