@@ -54,7 +54,7 @@ def test_a_rule_is_broken_where_its_condition_holds(rule, document, broken):
 
 
 @pytest.mark.parametrize(("rule", "found"), [("parameter_mismatch>15%", "it is 10 %"), ("share>15%", "it is 10 %"),
-                                             ("parameter_mismatch", "it is claimed, with 10 % of the gap")])
+                                             ("parameter_mismatch", "it is claimed, with 10 % of the squared gap")])
 def test_shares_are_those_of_what_is_claimed(rule, found):
     """Of two parameters that are claimed, beside one that was a rival and has no share."""
     claimed, rival = (Candidate("parameter_mismatch", "arm", 0.9, {}, was, 0.02, share)

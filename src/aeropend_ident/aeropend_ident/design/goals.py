@@ -33,10 +33,11 @@ APART = SURE + math.sqrt(SURE**2 + 2.0 * math.log(1.0 / CALIBRATED.undecided - 1
 """Standard deviations by which an effect should differ from a rival: 4.6.
 
 Derived: the log odds of two hypotheses that differ by d are normal with mean d²/2 and standard deviation d. With this d
-a rival is ruled out, its probability below that of a verdict that is undecided, in 95 % of all recordings."""
+a rival's probability is below that of a verdict that is undecided in 95 % of all recordings. `diagnose` asks for more
+than evidence (docs/results/design.md)."""
 
 SHARPER = 10.0
-"""Factor by which a number should become better known (choice: then its prior hardly counts)."""
+"""Factor by which a parameter should become better known (choice: then its prior hardly counts)."""
 
 
 @dataclass(frozen=True)

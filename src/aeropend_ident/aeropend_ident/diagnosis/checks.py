@@ -136,7 +136,7 @@ def _of(document: DiagnosisDocument, rule: Rule) -> tuple[str, bool]:
             return "there is nothing to close" if rule.name == "closed" else "no effect is claimed", False
         value = min(values) if rule.sign == "<" else max(values)
     elif not rule.sign:
-        return (f"it is claimed, with {100.0 * shares[rule.name]:.3g} % of the gap" if rule.name in shares
+        return (f"it is claimed, with {100.0 * shares[rule.name]:.3g} % of the squared gap" if rule.name in shares
                 else "it is not claimed"), rule.name in shares
     else:
         value = shares.get(rule.name, 0.0)

@@ -350,7 +350,7 @@ def why_unsure(share: Mapping[str, Interval], material: float) -> str:
         return ""
     name = max(found, key=lambda n: found[n].value)
     return (f"no effect brings the model surely closer to the unseen part: the likeliest, {name}, has "
-            f"{found[name].value:.0%} ({found[name].low:.0%} to {found[name].high:.0%}) of the gap; a recording with "
+            f"{found[name].value:.0%} ({found[name].low:.0%} to {found[name].high:.0%}) of the squared gap; a recording with "
             "more motion in its last third, or several recordings, help most")
 
 
