@@ -105,11 +105,11 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
                         help="folder of an earlier verdict of the rig, whose model is the nominal one: the verdict is "
                              "what has changed; several show how far the rig differs from run to run")
     parser.add_argument("--variants", metavar="FILE",
-                        help="file that says which parameters of the model differ in which recordings, as with a payload "
-                             "or another propeller")
+                        help="file that says which parameters of the model differ in which recordings, as with a "
+                             "payload or another propeller")
     parser.add_argument("--material", type=between(0.0, 1.0, "a share"), default=MATERIAL_SHARE, metavar="SHARE",
-                        help="share of the squared gap from which an effect is claimed; smaller ones are listed as small "
-                             f"(default: {MATERIAL_SHARE:g})")
+                        help="share of the squared gap from which an effect is claimed; smaller ones are listed as "
+                             f"small (default: {MATERIAL_SHARE:g})")
     parser.add_argument("--seconds", type=between(0.0, 1e6, "a time", "s"), metavar="S",
                         help="how long identification and search may take; what has begun is brought to an end, and a "
                              "note tells if more time could change the verdict (default: a number of simulations "
