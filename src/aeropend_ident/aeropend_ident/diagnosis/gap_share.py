@@ -350,8 +350,8 @@ def why_unsure(share: Mapping[str, Interval], material: float) -> str:
         return ""
     name = max(found, key=lambda n: found[n].value)
     return (f"no effect brings the model surely closer to the unseen part: the likeliest, {name}, has "
-            f"{found[name].value:.0%} ({found[name].low:.0%} to {found[name].high:.0%}) of the squared gap; a recording "
-            "with more motion in its last third, or several recordings, help most")
+            f"{found[name].value:.0%} ({found[name].low:.0%} to {found[name].high:.0%}) of the squared gap; a "
+            "recording with more motion in its last third, or several recordings, help most")
 
 
 def share_of_places(parts: Sequence[Part], otherwise: Callable[[], Sequence[Part]]) -> list[tuple[str, float]]:
