@@ -26,6 +26,9 @@ FORMS = ("table", "other", "third")
 FLOORS = (1.5, 10.0)
 """RMS, in floors, of what no refit of the numbers absorbs, in the channel where it is largest."""
 
+ROUNDED = 1e-9
+"""Room of a number beyond its tolerance, relative: a number at its end is not outside by rounding (choice)."""
+
 PLACES = {
     "bridge_drop": "actuator", "supply_sag": "actuator", "supply_drift": "actuator", "command_delay": "actuator",
     "brush_drop": "electrical", "winding_heating": "electrical", "rotor_friction": "rotor", "thrust_lag": "thrust",
@@ -60,7 +63,8 @@ class Case:
     Attributes:
         name: of the recording. kind: single, none, two or outside. form: table or other.
         numbers: the rig's true numbers. effects: id, place and parameters of each. size: floors, of each effect.
-        seed: of chance in the recording. closed_loop: the duty came from a controller.
+        seed: of chance in the recording. closed_loop: the duty came from a controller. shares: of two effects, the
+            share of the squared gap that a rig without it would not have, by id.
     """
 
     name: str
@@ -72,6 +76,7 @@ class Case:
     sizes: list[float]
     seed: int
     closed_loop: bool = False
+    shares: dict[str, float] = field(default_factory=dict)
     extra: dict[str, object] = field(default_factory=dict)
 
     def label(self) -> dict[str, object]:
@@ -187,6 +192,43 @@ class Sizer:
             x = min(max(x, math.log(start / 30.0)), math.log(start * most))
         best, error = min(known, key=lambda k: abs(k[1]))
         return math.exp(best), goal * math.exp(error)
+
+
+class Weighed(Sizer):
+    """A rig whose effects are weighed by the gap that they leave after a refit of the numbers of the model file.
+
+    Each number stays within `OFF` of that in the model file, from which the rig's own may differ as much.
+    """
+
+    def __init__(self, numbers: Mapping[str, float], nominal: Mapping[str, float], sensing: Mapping[str, float],
+                 duty: Array) -> None:
+        super().__init__(numbers, sensing, duty)
+        off = np.array([nominal[n] / numbers[n] for n in NUMBERS if numbers[n] != 0.0])
+        self.room = off * (1.0 - OFF) - 1.0 - ROUNDED, off * (1.0 + OFF) - 1.0 + ROUNDED
+
+    def moved(self, p: Array, gusts: Array) -> Array:
+        """What effects change of the readings, all channels as one vector, in floors."""
+        y, v, _ = plant.states(p, self.duty, gusts)
+        return self.stack(plant.shown(p, y, v)) - self.base
+
+    def rest(self, moved: Array) -> Array:
+        """What no refit of the numbers absorbs, (4, N), each channel in floors."""
+        refit = lsq_linear(self.r, self.q.T @ moved, self.room).x
+        return (moved - self.q @ (self.r @ refit)).reshape(len(self.floor), -1)
+
+    def gap(self, moved: Array) -> float:
+        """The mean square of that over the spread of each channel, of all channels: the squared gap."""
+        spread = np.std(self.base.reshape(len(self.floor), -1), axis=1)
+        return float(np.mean((self.rest(moved) / spread[:, None]) ** 2))
+
+    def shares(self, moved: Mapping[str, Array]) -> dict[str, float]:
+        """Effect -> share of the squared gap that a rig without it would not have.
+
+        Args:
+            moved: effect -> what it alone changes of the readings.
+        """
+        total = np.sum(list(moved.values()), axis=0)
+        return {effect: 1.0 - self.gap(total - own) / self.gap(total) for effect, own in moved.items()}
 
 
 def others(id_: str, rng: np.random.Generator) -> dict[str, float]:
@@ -308,8 +350,13 @@ def draw(name: str, kind: str, effects: list[str], form: str, nominal: Mapping[s
         if e["effect"] == "gust":
             gusts = gusts_of(e, len(duty), other=FORMS.index(form) > 0)
         e.pop("draw", None)
+    shares = {}
+    if kind == "two":
+        rig, calm, form_ = Weighed(numbers, nominal, sensing, duty), np.zeros(0), FORMS.index(form)
+        shares = rig.shares({id_: rig.moved(rig.packed({id_: own}, {}, other=form_), gusts if id_ == "gust" else calm)
+                             for id_, own in inside.items()})  # type: ignore[dict-item]
     y, v, applied = plant.states(p, duty, gusts, pid(rng) if closed_loop else None)
     columns = plant.measured(p, y, v, sensing, rng)
     columns["duty"] = applied
-    case = Case(name, kind, form, numbers, drawn, min(sizes, default=0.0), sizes, seed, closed_loop)
+    case = Case(name, kind, form, numbers, drawn, min(sizes, default=0.0), sizes, seed, closed_loop, shares)
     return case, columns

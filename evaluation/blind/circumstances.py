@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 
 from aeropend_ident.testing import bags
 from aeropend_sim.model.parameters import Model, load
@@ -43,51 +42,12 @@ PART_OF_THREE = (0.03, 0.1)
 LARGEST, LARGEST_SMALL = 1.5, 0.4
 """Largest size of a main effect and of an imperfection, in sizes that `cases` starts from."""
 
-GHOST = 0.03
-"""True share of the gap below which an effect that is claimed is not there."""
-
 RESOLUTION, JITTER = (0.7, 1.3), 0.1
 """Resolutions and tick over those of the model file, and sample instants off by up to so many periods, if nothing is
 missing."""
 
-ROUNDED = 1e-9
-"""Room of a number beyond its tolerance, relative: a number at its end is not outside by rounding (choice)."""
-
 RANDOM_OR_STEPPED = ("command_delay", "speed_spikes", "current_clip", "slew_limit", "brown_outs")
 """Effects whose gap does not grow in proportion to their size: they are no imperfections of a messy rig."""
-
-
-class Weighed(cases.Sizer):
-    """A rig whose effects are weighed by the gap that they leave after a refit of the numbers of the model file.
-
-    Each number stays within `cases.OFF` of that in the model file, from which the rig's own may differ as much.
-    """
-
-    def __init__(self, numbers: Mapping[str, float], nominal: Mapping[str, float], sensing: Mapping[str, float],
-                 duty: Array) -> None:
-        super().__init__(numbers, sensing, duty)
-        off = np.array([nominal[n] / numbers[n] for n in cases.NUMBERS if numbers[n] != 0.0])
-        self.room = off * (1.0 - cases.OFF) - 1.0 - ROUNDED, off * (1.0 + cases.OFF) - 1.0 + ROUNDED
-
-    def moved(self, p: Array, gusts: Array) -> Array:
-        """What effects change of the readings, all channels as one vector, in floors."""
-        y, v, _ = plant.states(p, self.duty, gusts)
-        return self.stack(plant.shown(p, y, v)) - self.base
-
-    def rest(self, moved: Array) -> Array:
-        """What no refit of the numbers absorbs, (4, N), each channel in floors."""
-        refit = lsq_linear(self.r, self.q.T @ moved, self.room).x
-        return (moved - self.q @ (self.r @ refit)).reshape(len(self.floor), -1)
-
-    def gap(self, moved: Array) -> float:
-        """The mean square of that over the spread of each channel, of all channels: the squared gap."""
-        spread = np.std(self.base.reshape(len(self.floor), -1), axis=1)
-        return float(np.mean((self.rest(moved) / spread[:, None]) ** 2))
-
-    def shares(self, drawn: Sequence[Drawn]) -> dict[str, float]:
-        """Effect -> share of the squared gap that a rig without it would not have."""
-        total = np.sum([d.moved for d in drawn], axis=0)
-        return {d.effect: 1.0 - self.gap(total - d.moved) / self.gap(total) for d in drawn}
 
 
 @dataclass(frozen=True)
@@ -108,7 +68,7 @@ class Drawn:
     gusts: Array
     moved: Array
 
-    def scaled(self, rig: Weighed, factor: float, most: float = LARGEST) -> Drawn:
+    def scaled(self, rig: cases.Weighed, factor: float, most: float = LARGEST) -> Drawn:
         """The effect at another size, at most one that a rig might have."""
         own = dict(self.parameters)
         head, start, neutral = cases.scale(self.effect)
@@ -118,13 +78,13 @@ class Drawn:
         return Drawn(self.effect, self.place, own, gusts, rig.moved(_packed(rig, [(self.effect, own)]), gusts))
 
 
-def _packed(rig: Weighed, effects: Sequence[tuple[str, Mapping[str, float]]]) -> Array:
+def _packed(rig: cases.Weighed, effects: Sequence[tuple[str, Mapping[str, float]]]) -> Array:
     inside = {e: own for e, own in effects if e in EFFECTS}
     outside = {e: own["size"] for e, own in effects if e in OUTSIDE}
     return rig.packed(inside, outside, other=True)
 
 
-def small(effect: str, rig: Weighed, rng: np.random.Generator) -> Drawn:
+def small(effect: str, rig: cases.Weighed, rng: np.random.Generator) -> Drawn:
     """An imperfection of a messy rig: an effect in another form than the catalogue's, at a size of about a floor."""
     own = cases.parameters_of(effect, rng)(0.1 * cases.scale(effect)[1])
     gusts = np.zeros(0)
@@ -140,7 +100,7 @@ def _floors(rest: Array) -> float:
     return float(np.sqrt(np.mean(rest**2, axis=1)).max())
 
 
-def messy(rng: np.random.Generator, rig: Weighed) -> tuple[list[Drawn], dict[str, float]]:
+def messy(rng: np.random.Generator, rig: cases.Weighed) -> tuple[list[Drawn], dict[str, float]]:
     """A rig with many small imperfections and one main effect; and the share of each in the gap."""
     kinds = [e for e in (*EFFECTS, *OUTSIDE) if e not in RANDOM_OR_STEPPED]
     mains = [e for e in EFFECTS if e not in RANDOM_OR_STEPPED]
@@ -154,12 +114,12 @@ def messy(rng: np.random.Generator, rig: Weighed) -> tuple[list[Drawn], dict[str
         for _ in range(4):  # the gap of an effect grows about with its size
             one = one.scaled(rig, math.sqrt(goal / (1.0 - goal) / max(rig.gap(one.moved) / behind, 1e-6)))
         all_ = [one, *background]
-        shares = rig.shares(all_)
+        shares = rig.shares({d.effect: d.moved for d in all_})
         if shares[main] > MAIN_SHARE[0] and all(shares[main] > shares[d.effect] for d in background):
             return all_, shares
 
 
-def three(effects: Sequence[str], rng: np.random.Generator, rig: Weighed) -> tuple[list[Drawn], dict[str, float]]:
+def three(effects: Sequence[str], rng: np.random.Generator, rig: cases.Weighed) -> tuple[list[Drawn], dict[str, float]]:
     """A rig with effects that make comparable parts of the gap; and the share of each."""
     drawn = [small(e, rig, rng) for e in effects]
     for k, d in enumerate(drawn):
@@ -167,7 +127,7 @@ def three(effects: Sequence[str], rng: np.random.Generator, rig: Weighed) -> tup
         for _ in range(4):
             d = d.scaled(rig, goal / max(math.sqrt(rig.gap(d.moved)), 1e-6))
         drawn[k] = d
-    return drawn, rig.shares(drawn)
+    return drawn, rig.shares({d.effect: d.moved for d in drawn})
 
 
 def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing: Mapping[str, float], seed: int,
@@ -196,7 +156,7 @@ def make(row: str, effects: Sequence[str], nominal: Mapping[str, float], sensing
         return {**label, "effects": [entry]}, {**columns, "duty": duty}, lost
     controller, gusts, other = None, np.zeros(0), True
     if row in {"messy", "three effects"}:
-        weighed = Weighed(numbers, nominal, sensing, duty)
+        weighed = cases.Weighed(numbers, nominal, sensing, duty)
         drawn, label["shares"] = messy(rng, weighed) if row == "messy" else three(effects, rng, weighed)
         p = _packed(weighed, [(d.effect, d.parameters) for d in drawn])
         gusts = next((d.gusts for d in drawn if len(d.gusts)), gusts)
@@ -306,9 +266,9 @@ class Judged:
 
     @property
     def material(self) -> set[str]:
-        """The keys of the effects in it that make `GHOST` of the gap or more."""
+        """The keys of the effects in it that make `score.MATERIAL` of the gap or more."""
         return {score.key_of(e["effect"], e["parameters"]) for e in self.label["effects"]
-                if self.label["shares"].get(e["effect"], 0.0) >= GHOST}
+                if self.label["shares"].get(e["effect"], 0.0) >= score.MATERIAL}
 
     @property
     def first(self) -> bool:
@@ -339,8 +299,8 @@ class Judged:
 
     @property
     def ghosts(self) -> int:
-        """Number of effects claimed that make less than `GHOST` of the gap, or none of it."""
-        return sum(self.label["shares"].get(score.id_of(key), 0.0) < GHOST for key in self.answer.found)
+        """Number of effects claimed that make less than `score.MATERIAL` of the gap, or none of it."""
+        return sum(self.label["shares"].get(score.id_of(key), 0.0) < score.MATERIAL for key in self.answer.found)
 
     @property
     def shares_held(self) -> list[bool]:

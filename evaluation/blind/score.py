@@ -33,6 +33,10 @@ PROBABILITIES = (0.0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 1.0)
 """Edges of the classes of stated probability."""
 
 
+MATERIAL = 0.03
+"""True share of the squared gap from which an effect should be claimed; one that is claimed below it is not there."""
+
+
 @dataclass(frozen=True)
 class TrueEffect:
     """An effect that a recording holds: its key, its place, and its true parameters where the form has them."""
@@ -44,13 +48,17 @@ class TrueEffect:
 
 @dataclass(frozen=True)
 class Label:
-    """The truth about a recording: `kind` of `KINDS`, `form` "table" or "other", `size` in floors, 0 if it has none."""
+    """The truth about a recording: `kind` of `KINDS`, `form` "table" or "other", `size` in floors, 0 if it has none.
+
+    `shares` has the share of the squared gap that a rig without an effect would not have, by id, where it is known.
+    """
 
     name: str
     kind: str
     form: str
     effects: tuple[TrueEffect, ...]
     size: float
+    shares: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def read(cls, label: Mapping[str, Any]) -> Label:
@@ -65,7 +73,7 @@ class Label:
         kind, form = label["kind"], label["form"]
         if kind not in wanted or form not in {"table", "other"} or len(effects) != wanted[kind]:
             raise ValueError(f"label of {label['name']}: {len(effects)} effects of kind {kind!r}, form {form!r}")
-        return cls(label["name"], kind, form, effects, float(label["size"]))
+        return cls(label["name"], kind, form, effects, float(label["size"]), label.get("shares", {}))
 
     @property
     def keys(self) -> set[str]:
@@ -340,6 +348,8 @@ def besides(pairs: Pairs) -> list[Figure]:
     """Effects claimed besides the true ones, or listed as small; reported without a target."""
     single, two = of_kind(pairs, "single"), of_kind(pairs, "two")
     return [share("single: something claimed besides", [bool(set(a.found) - t.keys) for t, a in single]),
+            share("both of two, where each makes 3 % of the squared gap or more",
+                  [both(t, a) for t, a in two if min(t.shares.values(), default=0.0) >= MATERIAL]),
             share("both of two, or one of them listed as small", [listed(t.keys, a) for t, a in two]),
             share("both of two and nothing besides", [both(t, a) and set(a.found) == t.keys for t, a in two])]
 

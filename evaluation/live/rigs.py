@@ -233,7 +233,7 @@ def imperfections(seed: int) -> dict[str, dict[str, float]]:
     """The imperfections of a messy rig: effects outside of the catalogue and in it, each of about a floor."""
     rng = np.random.default_rng([seed, 1])
     model = load("bench")
-    rig = circumstances.Weighed(model.model, model.model, model.sensing, cases.duty_signal(rng, SIZED_ON))
+    rig = cases.Weighed(model.model, model.model, model.sensing, cases.duty_signal(rng, SIZED_ON))
     kinds = [e for e in (*EFFECTS, *plant.OUTSIDE)
              if e not in circumstances.RANDOM_OR_STEPPED and e not in (*GROWING, "gust")]
     count = int(rng.integers(*circumstances.BACKGROUND, endpoint=True))

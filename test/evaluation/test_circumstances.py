@@ -16,7 +16,7 @@ BENCH = load("bench")
 
 def test_a_messy_rig_has_many_imperfections_and_one_main_effect():
     rng = np.random.default_rng(3)
-    rig = circumstances.Weighed(BENCH.model, BENCH.model, BENCH.sensing, cases.duty_signal(rng, 20.0))
+    rig = cases.Weighed(BENCH.model, BENCH.model, BENCH.sensing, cases.duty_signal(rng, 20.0))
     drawn, shares = circumstances.messy(rng, rig)
     assert 11 <= len(drawn) <= 13
     assert len({d.effect for d in drawn}) == len(drawn)
@@ -28,7 +28,7 @@ def test_a_messy_rig_has_many_imperfections_and_one_main_effect():
 def test_a_refit_absorbs_as_much_as_the_model_file_may_be_off():
     """The resistance is at the upper end of its tolerance: a refit may lower it, and not raise it."""
     numbers = {**BENCH.model, "R_a": (1.0 + cases.OFF) * BENCH.model["R_a"]}
-    rig = circumstances.Weighed(numbers, BENCH.model, BENCH.sensing, cases.duty_signal(np.random.default_rng(3), 10.0))
+    rig = cases.Weighed(numbers, BENCH.model, BENCH.sensing, cases.duty_signal(np.random.default_rng(3), 10.0))
 
     def left(factor):
         p = rig.packed({}, {}, other=False, numbers={**numbers, "R_a": factor * numbers["R_a"]})
