@@ -2,6 +2,7 @@
 """The model beside the rig, without ROS: residuals, detection, interruptions."""
 
 import copyreg
+import json
 import math
 from copy import deepcopy
 from dataclasses import replace
@@ -17,6 +18,7 @@ from aeropend_ident.live.bank import columns, size_of
 from aeropend_ident.live.companion_model import Companion, Samples
 from aeropend_ident.live.detector import Finding
 from aeropend_ident.live.intake import Batch, Intake
+from aeropend_ident.live.server import Page
 from aeropend_ident.live.watcher import PARTED, STALE, Watcher
 from aeropend_ident.nodes.topic_recorder import DEPTH
 from aeropend_ident.nodes.watch import why
@@ -63,12 +65,14 @@ def watched(duty: np.ndarray, read: np.ndarray) -> tuple[Watcher, list[float]]:
     return watcher, fed(watcher, duty, read, start=LEARNED)
 
 
-def fed(watcher: Watcher, duty: np.ndarray, read: np.ndarray, start: int = 0, stop: int | None = None) -> list[float]:
-    """Times of the alarms of a watcher that sees this, or the samples from `start` to `stop`."""
+def fed(watcher: Watcher, duty: np.ndarray, read: np.ndarray, start: int = 0, stop: int | None = None, away_ns: int = 0
+        ) -> list[float]:
+    """Times of the alarms of a watcher that sees this, or the samples from `start` to `stop`, after a break."""
     alarms = []
     for k in range(start, len(duty) - STEP if stop is None else stop, STEP):
         s = slice(k, k + STEP)
-        batch = Batch(PERIOD_NS * np.arange(k + 1, k + STEP + 1), Samples(*read[:, s], duty[s]))
+        batch = Batch(away_ns + PERIOD_NS * np.arange(k + 1, k + STEP + 1), Samples(*read[:, s], duty[s]),
+                      "a break" if away_ns and k == start else "")
         if watcher.step(batch)[1] is not None:
             alarms.append(watcher.detector.time)
     return alarms
@@ -104,6 +108,21 @@ def test_an_alarm_stays_until_it_is_cleared():
     duty, read = readings("bridge_drop", "v_drop", 0.2)
     last = slice(round((BEFORE + 2.0) / SAMPLE_PERIOD), None)
     assert not fed(watcher, duty[last], read[:, last])
+
+
+def test_an_alarm_keeps_its_instant_and_its_entry_on_the_page_when_samples_were_missing():
+    watcher, _ = watched(*readings("bridge_drop", "v_drop", 0.2))
+    page, (duty, read) = Page("127.0.0.1", 0, "bench"), readings("bridge_drop", "v_drop", 0.2)
+    told = []
+    for away in range(0, 40, 10):
+        page.state(watcher, Intake(), 10.0 * away)
+        told += json.loads(page._state)["state"]["history"]
+        fed(watcher, duty[-60 * STEP:], read[:, -60 * STEP:], away_ns=(120 + away) * 10**9)
+    page.close()
+    assert len(told) == 4
+    assert len({entry["at"] for entry in told}) == 1
+    assert all(abs(since - BEFORE) < 1.0 for since in (*(entry["since"] for entry in told),
+                                                       watcher.places["actuator"].since_ns * 1e-9))
 
 
 def test_what_cannot_be_a_reading_is_no_alarm_and_no_crash():

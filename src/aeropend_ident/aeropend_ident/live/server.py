@@ -100,6 +100,7 @@ class Page:
         self._past: deque[list[Any]] = deque(maxlen=round(SHOWN_S * 490.2 / THINNED))
         self._skip = 0
         self._history: deque[dict[str, Any]] = deque(maxlen=HISTORY)
+        self._listed = 0  # number of the alarm that is last in it
         self._state = ""
         self._sent_at = -math.inf
         self._nodes: dict[str, dict[str, Any]] = {}
@@ -192,13 +193,12 @@ class Page:
         """Send the state of the places, if it is time."""
         alarm = watcher.alarm
         if alarm is not None:
-            since = watcher.stamp_of(alarm.since) * 1e-9
-            entry = {"since": round(since, 2), "at": round(watcher.stamp_of(watcher.detector.alarm_at) * 1e-9, 2),
+            entry = {"since": round(watcher.since_ns * 1e-9, 2), "at": round(watcher.alarm_ns * 1e-9, 2),
                      "place": alarm.place, "effect": alarm.hypothesis, "probability": round(alarm.probability, 3)}
-            if self._history and self._history[-1]["at"] == entry["at"]:
-                self._history[-1] = entry
-            else:
-                self._history.append(entry)
+            if self._listed == watcher.alarms:
+                self._history.pop()  # what is likeliest may change while an alarm stands
+            self._history.append(entry)
+            self._listed = watcher.alarms
         if now < self._sent_at + STATE_S:
             return
         self._sent_at = now

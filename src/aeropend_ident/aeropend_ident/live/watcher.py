@@ -68,6 +68,7 @@ class Watcher:
         places: state of each place.
         free_gap: [floors] RMS of measured minus free-running model by channel, over about the last second.
         fault: why the samples cannot be judged; "" if they can.
+        alarms: number of alarms so far; that of the alarm that stands.
     """
 
     def __init__(self, model: Model, mean_hours: float = 24.0, period: float = SAMPLE_PERIOD) -> None:
@@ -78,9 +79,10 @@ class Watcher:
         self.places = {place: Place(STALE) for place in PLACES}
         self.free_gap = dict.fromkeys(CHANNELS, 0.0)
         self.fault = "no sample yet"
-        self.breaks = 0
+        self.breaks = self.alarms = 0
         self._duty = self._spread = 0.0
-        self._epoch_ns = 0  # stamp at time 0 of the detector
+        self._epoch_ns = 0  # stamp at time 0 of the detector, by its last tick
+        self._alarm_epoch_ns = 0  # the same by the tick of the alarm: the detector's time stands still in a break
 
     @property
     def to_learn(self) -> float:
@@ -97,9 +99,20 @@ class Watcher:
         """The change that was found, until `clear`."""
         return self.detector.alarm
 
-    def stamp_of(self, seconds: float) -> int:
-        """[ns] Stamp of a time of the detector."""
-        return self._epoch_ns + round(seconds * 1e9)
+    @property
+    def now_ns(self) -> int:
+        """[ns] Stamp of the last tick."""
+        return self._epoch_ns + round(self.detector.time * 1e9)
+
+    @property
+    def since_ns(self) -> int:
+        """[ns] Stamp of the instant at which what the alarm tells has begun; 0 without an alarm."""
+        return self._alarm_epoch_ns + round(self.alarm.since * 1e9) if self.alarm is not None else 0
+
+    @property
+    def alarm_ns(self) -> int:
+        """[ns] Stamp of the alarm; 0 without one."""
+        return self._alarm_epoch_ns + round(self.detector.alarm_at * 1e9) if self.alarm is not None else 0
 
     def step(self, batch: Batch, *, frozen: bool = False) -> tuple[Residuals, Finding | None]:
         """Take some samples.
@@ -133,6 +146,9 @@ class Watcher:
             self._epoch_ns = int(batch.stamps[-1]) - round(d.time * 1e9)
             if d.tick % JUDGED == 0:
                 found = d.judge()
+                if found is not None:
+                    self.alarms += 1
+                    self._alarm_epoch_ns = self._epoch_ns
                 self.fault = ""
                 self._look()
         return residuals, found
@@ -195,5 +211,5 @@ class Watcher:
                 effect, size = drifted[name]
             if finding is not None and (state == PARTED or finding.evidence > 0.0):
                 effect, probability, size = finding.hypothesis, finding.probability, finding.size
-                since = self.stamp_of(finding.since)
+                since = self.since_ns if state == PARTED else self._epoch_ns + round(finding.since * 1e9)
             self.places[name] = Place(state, seen.gap, seen.limit, residual[name], effect, probability, size, since)

@@ -117,7 +117,7 @@ class Watch(Node):
         self._ring = Ring()
         self._bag: AlarmBag | None = None
         self._children: list[subprocess.Popen[bytes]] = []
-        self._samples = self._malformed = self._alarms = 0
+        self._samples = self._malformed = 0
         self._heard = -math.inf
         self._crowded = self._told = ""
         self._warned: dict[str, float] = {}
@@ -290,7 +290,6 @@ class Watch(Node):
     # ---- alarms ----------------------------------------------------------------------------------------------------
 
     def _on_alarm(self, found: Finding) -> None:
-        self._alarms += 1
         self._tell(found, "model and rig have parted")
         message = DiagnosticArray(status=self._statuses())
         message.header.stamp = self.get_clock().now().to_msg()
@@ -308,7 +307,7 @@ class Watch(Node):
 
     def _tell(self, found: Finding, what: str) -> None:
         self._told = found.hypothesis if found.probability > SURE else ""
-        ago = self._watcher.detector.time - found.since
+        ago = (self._watcher.now_ns - self._watcher.since_ns) * 1e-9
         self.get_logger().error(f"{what} at {found.place}, {ago:.1f} s ago: {why(found)}")
 
     def _write_bag(self) -> None:
@@ -357,7 +356,7 @@ class Watch(Node):
             warnings.append(f"parted at {alarm.place}")
         values = {
             "samples": self._samples, "bridged": self._intake.lost, "impossible readings": self._intake.odd,
-            "malformed": self._malformed, "breaks": watcher.breaks, "alarms": self._alarms,
+            "malformed": self._malformed, "breaks": watcher.breaks, "alarms": watcher.alarms,
             "lost": sum(r.lost for r in self._recorders.values()),
             **{f"free run {channel}": gap[channel] for channel in gap},
             "learning": f"{watcher.to_learn:.0f} s of motion left" if watcher.to_learn else "done",
