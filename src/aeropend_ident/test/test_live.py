@@ -161,6 +161,20 @@ def test_batches_are_cut_where_samples_are_missing_or_the_clock_steps():
     assert "went back" in back.broken
 
 
+def test_stamps_that_jitter_or_repeat_do_not_start_the_model_anew():
+    intake, jitter = Intake(), np.random.default_rng(1).integers(-800_000, 800_000, 2000)
+    given = np.repeat(PERIOD_NS * np.arange(1, 2001) + jitter, np.where(np.arange(2000) % 5, 1, 2))
+    batches = []
+    for part in np.split(given, 40):
+        for stamp in part.tolist():
+            intake.joints(stamp, 0.1, 100.0)
+            intake.armature(stamp, 0.2, 0.5, 0.3)
+        batches += intake.take()
+    assert {b.broken for b in batches} == {"start", ""}
+    assert sum(len(b.stamps) for b in batches) == pytest.approx(2000, abs=1)
+    assert intake.doubled == pytest.approx(400, abs=5)  # some more until the grid is known
+
+
 def test_halves_are_joined_in_any_order_and_impossible_readings_are_counted():
     intake = Intake()
     intake.armature(PERIOD_NS, 0.1, 0.5, math.nan)

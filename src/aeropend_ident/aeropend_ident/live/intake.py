@@ -22,11 +22,16 @@ still (`topic_recorder.DEPTH`)."""
 BRIDGED = 0.25
 """[s] Longest run of lost samples that the model runs through (choice: a fifth of a swing of the arm)."""
 
-BACK = 0.5
-"""Periods by which a stamp must lie behind the one before to count as a step of the clock (derived: half a sample)."""
+FOLLOWED = 0.1
+"""Share of its distance by which the grid of the samples follows a stamp.
+
+Choice: stamps may jitter by almost half a period, and a clock may be some percent off."""
 
 FROZEN = 0.5
 """[s] Time of equal readings in all channels that have noise after which a rig counts as frozen (choice)."""
+
+_Row = tuple[int, float, float, float, float, float]
+"""Stamp [ns] and readings of a sample, in the order of `Samples`."""
 
 
 @dataclass
@@ -50,18 +55,21 @@ class Intake:
 
     Attributes:
         lost: number of samples that were bridged.
+        doubled: number of samples that were dropped: their stamp is nearest to the sample before on the grid.
         odd: number of readings that are no numbers, or impossible.
         frozen: whether the readings do not change.
     """
 
     period: float = SAMPLE_PERIOD
     lost: int = 0
+    doubled: int = 0
     odd: int = 0
     frozen: bool = False
     command: float = math.nan
     _halves: dict[int, tuple[float, ...]] = field(default_factory=dict)
-    _ready: list[tuple[int, float, float, float, float, float]] = field(default_factory=list)
+    _ready: list[_Row] = field(default_factory=list)
     _last: int | None = None
+    _grid: float = 0.0  # [ns] instant of the last sample by the stamps of many
     _same: int = 0
     _before: tuple[float, ...] = ()
 
@@ -96,11 +104,11 @@ class Intake:
 
     def take(self) -> list[Batch]:
         """The samples that are complete, cut where they are interrupted."""
-        ready, self._ready = self._ready, []
-        if not ready:
+        placed = self._placed()
+        if not placed:
             return []
-        table = np.array([row[1:] for row in ready], dtype=float)
-        stamps = np.array([row[0] for row in ready], dtype=np.int64)
+        table = np.array([row[1:] for row, *_ in placed], dtype=float)
+        stamps = np.array([row[0] for row, *_ in placed], dtype=np.int64)
         for k, channel in enumerate(Samples._fields):
             most = MOST[channel] + (ROUNDING if channel == "duty" else 0.0)
             bad = ~(np.abs(table[:, k]) <= most)
@@ -110,26 +118,39 @@ class Intake:
         batches: list[Batch] = []
         begin, broken = 0, ""
         filled: list[tuple[int, int]] = []  # where samples are missing, and how many
-        for k, stamp in enumerate(stamps.tolist()):
-            why = ""
-            if self._last is None:
-                why = "start"
-            else:
-                periods = (stamp - self._last) * 1e-9 / self.period
-                if periods < BACK:
-                    why = f"the stamps went back by {(self._last - stamp) * 1e-9:.3g} s"
-                elif periods * self.period > BRIDGED:
-                    why = f"{periods * self.period:.3g} s without a sample"
-                elif round(periods) > 1:
-                    filled.append((k, round(periods) - 1))
-                    self.lost += round(periods) - 1
+        for k, (_, missing, why) in enumerate(placed):
             if why:
                 if k > begin:
                     batches.append(self._batch(stamps, table, begin, k, broken, filled))
                 begin, broken, filled = k, why, []
-            self._last = stamp
+            elif missing:
+                filled.append((k, missing))
         batches.append(self._batch(stamps, table, begin, len(stamps), broken, filled))
         return batches
+
+    def _placed(self) -> list[tuple[_Row, int, str]]:
+        """What is complete, on the grid: the samples that are missing before each, and why it does not follow them."""
+        placed, period = [], self.period * 1e9
+        for row in self._ready:
+            stamp, steps, why = row[0], 1, ""
+            if self._last is None:
+                why = "start"
+            elif stamp < self._last:
+                why = f"the stamps went back by {(self._last - stamp) * 1e-9:.3g} s"
+            elif (stamp - self._last) * 1e-9 > BRIDGED:
+                why = f"{(stamp - self._last) * 1e-9:.3g} s without a sample"
+            else:
+                steps = round((stamp - self._grid) / period)
+            if steps < 1:
+                self.doubled += 1
+                continue
+            on = self._grid + steps * period
+            self._grid = stamp if why else on + FOLLOWED * (stamp - on)
+            self._last = stamp
+            self.lost += steps - 1
+            placed.append((row, steps - 1, why))
+        self._ready = []
+        return placed
 
     def _batch(self, stamps: NDArray[np.int64], table: NDArray[np.float64], begin: int, end: int, broken: str,
                filled: list[tuple[int, int]]) -> Batch:

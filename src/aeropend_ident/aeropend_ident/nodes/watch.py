@@ -355,9 +355,9 @@ class Watch(Node):
         if alarm is not None:
             warnings.append(f"parted at {alarm.place}")
         values = {
-            "samples": self._samples, "bridged": self._intake.lost, "impossible readings": self._intake.odd,
-            "malformed": self._malformed, "breaks": watcher.breaks, "alarms": watcher.alarms,
-            "lost": sum(r.lost for r in self._recorders.values()),
+            "samples": self._samples, "bridged": self._intake.lost, "doubled": self._intake.doubled,
+            "impossible readings": self._intake.odd, "malformed": self._malformed, "breaks": watcher.breaks,
+            "alarms": watcher.alarms, "lost": sum(r.lost for r in self._recorders.values()),
             **{f"free run {channel}": gap[channel] for channel in gap},
             "learning": f"{watcher.to_learn:.0f} s of motion left" if watcher.to_learn else "done",
             "statistic": watcher.detector.statistic, "limit": watcher.detector.limit,
@@ -398,7 +398,7 @@ def _status(name: str, place: Place) -> DiagnosticStatus:
 
 
 _ARM, _ROTOR = interface.JOINTS
-_NO_SAMPLES = "no samples: plant or bridge does not publish"
+_NO_SAMPLES = "no samples: plant or bridge does not publish, or its stamps stand still"
 
 
 def _check_writable(folder: Path) -> None:
