@@ -4,13 +4,17 @@
 import copyreg
 import json
 import math
+import os
+import resource
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numba.typed import List
+from rosbags.rosbag2 import Reader
 
 from aeropend_ident.commands import live
 from aeropend_ident.live import false_alarms
@@ -18,6 +22,7 @@ from aeropend_ident.live.bank import columns, size_of
 from aeropend_ident.live.companion_model import Companion, Samples
 from aeropend_ident.live.detector import Finding
 from aeropend_ident.live.intake import Batch, Intake
+from aeropend_ident.live.ring import AlarmBag, Message, Ring
 from aeropend_ident.live.server import Page
 from aeropend_ident.live.watcher import PARTED, STALE, Watcher
 from aeropend_ident.nodes.topic_recorder import DEPTH
@@ -198,6 +203,37 @@ def test_no_sample_is_lost_when_one_topic_comes_long_before_the_other():
     (batch,) = intake.take()
     assert np.array_equal(batch.stamps, stamps)
     assert intake.lost == 0
+
+
+def alarm_bag(path: Path) -> AlarmBag:
+    """A bag of an alarm, with some messages."""
+    bag = AlarmBag(path, Ring(), {"duty_command": "std_msgs/msg/Float64"}, lambda _: [], alarm_ns=10**9)
+    for k in range(1, 1001):
+        bag.add(Message(k * 10**6, "duty_command", bytes(12)))
+    return bag
+
+
+def test_two_watchers_may_write_the_bag_of_an_alarm_in_the_same_second(tmp_path):
+    bags = [alarm_bag(tmp_path / "alarm") for _ in range(3)]
+    for bag in bags:
+        bag.close()
+    assert [bag.path.name for bag in bags] == ["alarm", "alarm_2", "alarm_3"]
+    for bag in bags:
+        with Reader(bag.path) as reader:
+            assert reader.message_count == 1000
+
+
+def test_the_bag_of_an_alarm_that_cannot_be_written_is_closed(tmp_path):
+    bag = alarm_bag(tmp_path / "alarm")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8192, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            bag.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    held = [os.path.realpath(entry) for entry in Path("/proc/self/fd").iterdir()]
+    assert not [path for path in held if path.startswith(str(tmp_path))]
 
 
 def test_readings_that_do_not_change_are_frozen():

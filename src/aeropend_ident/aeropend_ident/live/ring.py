@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from rosbags.rosbag2.errors import WriterError
 from rosbags.typesys import Stores, get_typestore
 
 from aeropend_ident.bags.msgtypes import learn
@@ -49,23 +50,29 @@ class AlarmBag:
     """A bag that begins with what the ring holds and goes on with what comes.
 
     Args:
-        path: folder to make.
+        path: folder to make; if it is there, the next that is not: `path_2`.
         ring: the messages before the alarm.
         types: topic -> message type.
         offered: returns the QoS that the publishers of a topic offer, as for `BagWriter.add_connection`.
         alarm_ns: [ns] receive time of the alarm.
+
+    Attributes:
+        path: folder of the bag.
+        end_ns: [ns] receive time after which a message is not taken any more.
+
+    Raises:
+        OSError: the disk is full or failed, or the folder cannot be made.
     """
 
     def __init__(self, path: Path, ring: Ring, types: dict[str, str], offered: Callable[[str], Any], alarm_ns: int
                  ) -> None:
-        self.path = path
         self.end_ns = alarm_ns + round(AFTER_S * 1e9)
         self._types, self._offered = types, offered
         self._waiting = deque(ring.messages)
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
         self._connections: dict[str, Any] = {}
-        self._writer = BagWriter(path)
-        self._writer.open()
+        self._writer = _opened(path)
+        self.path = self._writer.path
 
     def add(self, message: Message) -> None:
         """Take a message that came after the alarm."""
@@ -76,7 +83,7 @@ class AlarmBag:
         """Write some of what waits; returns whether the bag is complete and closed.
 
         Raises:
-            OSError: the disk is full or failed.
+            OSError: the disk is full or failed; the bag is given up.
         """
         self._write(AT_ONCE)
         if self._waiting or now_ns < self.end_ns:
@@ -84,22 +91,41 @@ class AlarmBag:
         self.close()
         return True
 
-    def _write(self, most: int) -> None:
-        for _ in range(min(most, len(self._waiting))):
-            message = self._waiting.popleft()
-            if message.topic not in self._connections:
-                msgtype = self._types[message.topic]
-                learn(self._typestore, msgtype)
-                self._connections[message.topic] = self._writer.add_connection(
-                    message.topic, msgtype, typestore=self._typestore,
-                    offered_qos_profiles=self._offered(message.topic))
-            self._writer.write(self._connections[message.topic], message.received, message.data)
-
     def close(self) -> None:
         """Write what waits, and end the bag.
 
         Raises:
-            OSError: the disk is full or failed.
+            OSError: as for `write`.
         """
-        self._write(len(self._waiting))
-        self._writer.close()
+        self._write(len(self._waiting), last=True)
+
+    def _write(self, most: int, *, last: bool = False) -> None:
+        try:
+            for _ in range(min(most, len(self._waiting))):
+                self._put(self._waiting.popleft())
+            if last:
+                self._writer.close()
+        except Exception:
+            self._writer.abort()  # else its file stays open
+            raise
+
+    def _put(self, message: Message) -> None:
+        if message.topic not in self._connections:
+            msgtype = self._types[message.topic]
+            learn(self._typestore, msgtype)
+            self._connections[message.topic] = self._writer.add_connection(
+                message.topic, msgtype, typestore=self._typestore, offered_qos_profiles=self._offered(message.topic))
+        self._writer.write(self._connections[message.topic], message.received, message.data)
+
+
+def _opened(path: Path, number: int = 1) -> BagWriter:
+    """A new bag at a path, or beside it: two watchers may give the alarm in the same second into the same folder."""
+    own = path if number == 1 else path.with_name(f"{path.name}_{number}")
+    try:
+        writer = BagWriter(own)
+        writer.open()
+    except WriterError:
+        if not own.exists():
+            raise
+        return _opened(path, number + 1)
+    return writer

@@ -22,6 +22,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
+from rosbags.rosbag2.errors import WriterError
 from sensor_msgs.msg import BatteryState, JointState
 from std_srvs.srv import Trigger
 from threadpoolctl import threadpool_limits
@@ -156,8 +157,8 @@ class Watch(Node):
         if self._bag is not None:
             try:
                 self._bag.close()
-            except OSError as error:
-                self.get_logger().error(f"{self._bag.path}: {error.strerror}: the bag of the alarm is not whole")
+            except _BAG_FAILS as error:
+                self._bag_fails(self._bag.path, error, "is not whole")
         for child in self._children:
             child.terminate()
         self._subscriber.destroy_node()
@@ -302,8 +303,13 @@ class Watch(Node):
             self._bag = AlarmBag(path, self._ring, {name: TOPICS[short] for name, short in self._names.items()},
                                  lambda topic: [qos_of(info.qos_profile) for info in
                                                 self.get_publishers_info_by_topic(topic)], time.time_ns())
-        except OSError as error:
-            self.get_logger().error(f"{path}: {error.strerror}: the alarm has no bag")
+        except _BAG_FAILS as error:
+            self._bag_fails(path, error, "cannot be made")
+
+    def _bag_fails(self, path: Path, error: Exception, what: str) -> None:
+        reason = getattr(error, "strerror", None) or error
+        self.get_logger().error(f"{path}: {reason}: the bag of the alarm {what}; make room on its disk, or give another"
+                                " folder, as in -p bags:=alarms")
 
     def _tell(self, found: Finding, what: str) -> None:
         self._told = found.hypothesis if found.probability > SURE else ""
@@ -316,8 +322,8 @@ class Watch(Node):
         try:
             if not self._bag.write(time.time_ns()):
                 return
-        except OSError as error:
-            self.get_logger().error(f"{path}: {error.strerror}: the bag of the alarm is not whole")
+        except _BAG_FAILS as error:
+            self._bag_fails(path, error, "is not whole")
             self._bag = None
             return
         self._bag = None
@@ -398,6 +404,7 @@ def _status(name: str, place: Place) -> DiagnosticStatus:
 
 
 _ARM, _ROTOR = interface.JOINTS
+_BAG_FAILS = OSError, WriterError
 _NO_SAMPLES = "no samples: plant or bridge does not publish, or its stamps stand still"
 
 
