@@ -57,6 +57,7 @@ def test_the_model_speaks_beside_the_rig_and_the_page_shows_what_is_published(gr
         assert b"http://" not in answer.read()
     assert graph.call(Trigger, "watch/clear", Trigger.Request()).success
     assert watch.stop() == 0
+    assert "no sample yet" not in watch.output
 
 
 def test_a_folder_for_bags_that_cannot_be_made_is_refused_at_the_start(tmp_path):

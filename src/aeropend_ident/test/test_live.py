@@ -144,6 +144,22 @@ def test_what_cannot_be_a_reading_is_no_alarm_and_no_crash():
     assert np.isfinite(watched(duty, huge)[0].detector.statistic)
 
 
+def test_a_fault_is_told_as_long_as_it_lasts():
+    watcher, quiet = Watcher(load("bench")), np.zeros((5, STEP))
+
+    def give(k, readings):
+        watcher.step(Batch(PERIOD_NS * np.arange(k * STEP, (k + 1) * STEP), Samples(*readings)))
+        return watcher.fault, {place.state for place in watcher.places.values()}
+
+    assert watcher.fault == "no sample yet"
+    assert give(0, quiet)[0] == ""
+    assert not [give(k, quiet) for k in range(1, 8)][-1][1] & {STALE}
+    assert give(8, np.full((5, STEP), 1e200)) == ("the readings are impossible", {STALE})
+    assert give(9, quiet)[0] == ""
+    watcher.silent("2 publishers")
+    assert give(10, quiet)[0] == ""
+
+
 def test_batches_are_cut_where_samples_are_missing_or_the_clock_steps():
     intake = Intake()
 

@@ -119,7 +119,7 @@ class Watcher:
 
         Args:
             batch: consecutive samples.
-            frozen: the readings do not change: nothing is judged.
+            frozen: whether the readings do not change: then nothing is judged.
 
         Returns:
             What the model says of them, and the change that was found with them, if it is new.
@@ -133,14 +133,14 @@ class Watcher:
                 np.concatenate(residuals.said)).all():
             self.companion.restart()  # impossible readings have driven a model out of all range
             self.detector.restart()
-            self.fault = "the readings are impossible"
+            self._stale("the readings are impossible")
             return residuals, None
         self._compare(batch, residuals)
         if frozen:
             self.detector.restart()
             self._stale("the readings do not change: the sensors are frozen")
             return residuals, None
-        found = None
+        self.fault, found = "", None
         d = self.detector
         if d.step(residuals, len(batch.stamps) * self.period, self._moves(batch)):
             self._epoch_ns = int(batch.stamps[-1]) - round(d.time * 1e9)
@@ -149,7 +149,6 @@ class Watcher:
                 if found is not None:
                     self.alarms += 1
                     self._alarm_epoch_ns = self._epoch_ns
-                self.fault = ""
                 self._look()
         return residuals, found
 

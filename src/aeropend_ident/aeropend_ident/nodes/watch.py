@@ -256,6 +256,8 @@ class Watch(Node):
             if batch.broken and batch.broken != "start":
                 self._warn(f"{batch.broken}: the model starts anew")
             residuals, found = watcher.step(batch, frozen=self._intake.frozen)
+            if watcher.fault:
+                self._warn(watcher.fault)
             self._publish(batch.stamps.tolist(), residuals.said)
             self._samples += len(batch.stamps)
             self._heard = now
@@ -272,8 +274,6 @@ class Watch(Node):
             watcher.silent(_NO_SAMPLES)
             self._intake.forget()
             self._warn(_NO_SAMPLES)
-        if watcher.fault not in ("", _NO_SAMPLES) and batches:
-            self._warn(watcher.fault)
         if self._bag is not None:
             self._write_bag()
         if self._page is not None:
