@@ -10,12 +10,17 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from evaluation.support.graph import parameters, stamps
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import BatteryState, JointState
+from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from tornado.ioloop import IOLoop
 from tornado.websocket import websocket_connect
 
 from aeropend_ident.nodes import said
+from aeropend_ident.nodes.topic_recorder import TopicRecorder
 from aeropend_sim.model.effects import PLACES
 from aeropend_sim.ros import interface
 
@@ -58,6 +63,29 @@ def test_the_model_speaks_beside_the_rig_and_the_page_shows_what_is_published(gr
     assert graph.call(Trigger, "watch/clear", Trigger.Request()).success
     assert watch.stop() == 0
     assert "no sample yet" not in watch.output
+
+
+def test_no_message_is_lost_when_a_publisher_of_another_qos_comes(graph):
+    subscriber, topic, taken = Node("counting", context=graph.node.context), "/counted", []
+    recorder = TopicRecorder(topic, "std_msgs/msg/Float64")
+
+    def look():
+        recorder.follow(subscriber, subscriber.get_publishers_info_by_topic(topic), 0.0,
+                        lambda: taken.extend(iter(recorder.take, None)))
+        return recorder.publishers
+
+    reliable = graph.node.create_publisher(Float64, topic, 100)
+    graph.until(lambda: look() == 1 and reliable.get_subscription_count(), "the subscription")
+    for k in range(50):
+        reliable.publish(Float64(data=float(k)))
+    assert reliable.wait_for_all_acked(Duration(seconds=20))
+    other = graph.node.create_publisher(Float64, topic, QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    graph.until(lambda: look() == 2, "the other publisher")
+    assert recorder.qos.reliability == ReliabilityPolicy.BEST_EFFORT
+    assert len(taken) == 50
+    for publisher in (reliable, other):
+        graph.node.destroy_publisher(publisher)
+    subscriber.destroy_node()
 
 
 def test_a_folder_for_bags_that_cannot_be_made_is_refused_at_the_start(tmp_path):

@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
 from rclpy.exceptions import InvalidTopicNameException
@@ -32,7 +33,7 @@ from rosbags.typesys import Stores, get_typestore
 from aeropend_ident.bags.container import STORAGES
 from aeropend_ident.bags.msgtypes import learn
 from aeropend_ident.bags.writer import PLUGINS, BagWriter
-from aeropend_ident.nodes.topic_recorder import TopicRecorder, qos_for, qos_of
+from aeropend_ident.nodes.topic_recorder import TopicRecorder, qos_of
 from aeropend_sim.errors import UserError
 from aeropend_sim.ros import interface
 from aeropend_sim.ros.diagnostics import Diagnostics
@@ -248,16 +249,8 @@ class Record(Node):
                 self._display.say(f"{topic} is not recorded: {error}", warn=True)
                 return
             self._recorders[topic] = recorder
-        publishers = self.get_publishers_info_by_topic(topic)
-        recorder.count_publishers(len(publishers), now)
-        qos = qos_for([info.qos_profile for info in publishers])
-        if recorder.subscription is None or (recorder.publishers and qos != recorder.qos):
-            if recorder.subscription is not None:
-                self._drain(recorder)
-                self._subscriber.destroy_subscription(recorder.subscription)
-            recorder.qos = qos
-            recorder.subscription = self._subscriber.create_subscription(recorder.message_class, topic, _ignore, qos,
-                                                                         raw=True)
+        recorder.follow(self._subscriber, self.get_publishers_info_by_topic(topic), now,
+                        partial(self._drain, recorder))
         silent = topic in self._sampled and now - recorder.heard > SILENT_S
         if silent and not recorder.silent:
             since = "no message yet" if not recorder.count else "silent"
@@ -358,10 +351,6 @@ def losses(lost: Mapping[str, int], joining: int) -> str:
     of = ", ".join(f"{topic} {count}" for topic, count in lost.items() if count)
     when = f", {joining} of them in the first second of a publisher" if joining else ""
     return f"{sum(lost.values())} lost ({of}){when}"
-
-
-def _ignore(message: bytes) -> None:
-    """A callback that is never called: no executor serves the subscription."""
 
 
 def _remove_bag(path: Path) -> None:

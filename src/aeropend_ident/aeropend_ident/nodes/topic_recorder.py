@@ -5,9 +5,12 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
 from aeropend_ident.bags.msgtypes import message_class
@@ -76,6 +79,26 @@ class TopicRecorder:
             self._last.append(number)
         return info["received_timestamp"], message
 
+    def follow(self, subscriber: Node, publishers: Sequence[TopicEndpointInfo], now: float, drain: Callable[[], None]
+               ) -> None:
+        """Subscribe with a QoS that all publishers are compatible with, unless the subscription has it already.
+
+        Args:
+            subscriber: node of the subscription.
+            publishers: of the topic now.
+            now: [s] monotonic time.
+            drain: takes what waits in the subscription, before another one takes its place.
+        """
+        self.count_publishers(len(publishers), now)
+        qos = qos_for([info.qos_profile for info in publishers])
+        if self.subscription is not None and (not publishers or qos == self.qos):
+            return
+        if self.subscription is not None:
+            drain()
+            subscriber.destroy_subscription(self.subscription)
+        self.qos = qos
+        self.subscription = subscriber.create_subscription(self.message_class, self.topic, _ignore, qos, raw=True)
+
     def count_publishers(self, publishers: int, now: float) -> None:
         """Note the number of publishers.
 
@@ -127,6 +150,10 @@ def qos_of(qos: QoSProfile) -> Qos:
         _time(qos.liveliness_lease_duration.nanoseconds),
         qos.avoid_ros_namespace_conventions,
     )
+
+
+def _ignore(message: bytes) -> None:
+    """A callback that is never called: no executor serves the subscription."""
 
 
 def _time(nanoseconds: int) -> QosTime:

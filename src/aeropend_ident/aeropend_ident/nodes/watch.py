@@ -16,6 +16,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ from aeropend_ident.live.intake import Intake
 from aeropend_ident.live.ring import AlarmBag, Message, Ring
 from aeropend_ident.live.watcher import DRIFTED, PARTED, STALE, Place, Watcher
 from aeropend_ident.nodes import said
-from aeropend_ident.nodes.topic_recorder import TopicRecorder, qos_for, qos_of
+from aeropend_ident.nodes.topic_recorder import TopicRecorder, qos_of
 from aeropend_sim.errors import UserError
 from aeropend_sim.model.parameters import PRESETS, load
 from aeropend_sim.ros import interface
@@ -192,15 +193,8 @@ class Watch(Node):
     def _look(self, now: float) -> None:
         """Subscribe to topics that have publishers, with a QoS that all of them are compatible with."""
         for name, recorder in self._recorders.items():
-            publishers = self.get_publishers_info_by_topic(name)
-            recorder.count_publishers(len(publishers), now)
-            qos = qos_for([info.qos_profile for info in publishers])
-            if recorder.subscription is None or (recorder.publishers and qos != recorder.qos):
-                if recorder.subscription is not None:
-                    self._subscriber.destroy_subscription(recorder.subscription)
-                recorder.qos = qos
-                recorder.subscription = self._subscriber.create_subscription(recorder.message_class, name, _ignore, qos,
-                                                                             raw=True)
+            recorder.follow(self._subscriber, self.get_publishers_info_by_topic(name), now,
+                            partial(self._drain, name, recorder))
         crowds = [f"{r.publishers} publishers of {self._names[name]}: end all but one" for name, r in
                   self._recorders.items() if self._names[name] in (interface.JOINT_STATES, interface.ARMATURE)
                   and r.publishers > 1]
@@ -414,10 +408,6 @@ def _check_writable(folder: Path) -> None:
     if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
         raise UserError(f"bags: {folder} cannot be written ({there} is {'not yours' if there.is_dir() else 'a file'}); "
                         "give another folder, as in -p bags:=alarms, or an empty name for no bags")
-
-
-def _ignore(message: bytes) -> None:
-    """A callback that is never called: no executor serves the subscription."""
 
 
 def main(args: Sequence[str] | None = None) -> int:
