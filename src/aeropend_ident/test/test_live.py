@@ -19,7 +19,7 @@ from rosbags.rosbag2 import Reader
 from aeropend_ident.commands import live
 from aeropend_ident.live import false_alarms
 from aeropend_ident.live.bank import columns, size_of
-from aeropend_ident.live.companion_model import Companion, Samples
+from aeropend_ident.live.companion_model import CHANNELS, Companion, Samples
 from aeropend_ident.live.detector import Finding
 from aeropend_ident.live.intake import Batch, Intake
 from aeropend_ident.live.ring import AlarmBag, Message, Ring
@@ -27,6 +27,7 @@ from aeropend_ident.live.server import Page
 from aeropend_ident.live.watcher import PARTED, STALE, Watcher
 from aeropend_ident.nodes.topic_recorder import DEPTH
 from aeropend_ident.nodes.watch import why
+from aeropend_sim.model import effect_file
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model, load
 from aeropend_sim.model.rig import Rig
@@ -316,6 +317,36 @@ def test_an_effect_that_is_linear_in_two_parameters_has_two_columns_for_all_thei
     sizes = np.linalg.lstsq(rows[:, :1] - rows[:, [1 + k for k in at]], rows[:, 0], rcond=None)[0]
     found = size_of(two, [size * c.step for size, c in zip(sizes, two, strict=True)])
     assert found == pytest.approx(next(iter(own.values())), rel=0.1)
+
+
+BY_FORMULA = {
+    "theta": {"place": "sensing", "reading": "theta", "term": "k * sin(3 * theta) * (1 + step(t - 5))"},
+    "i_a": {"place": "sensing", "reading": "i_a", "term": "k * abs(i_a)"},
+    "v_a": {"place": "sensing", "reading": "v_a", "term": "k * v * step(t - 5)"},
+    "late step": {"place": "actuator", "term": "k * v * step(t - 5)"},
+    "memory": {"place": "actuator", "term": "k * (z - v)",
+               "memory": {"name": "z", "unit": "V", "rate": "(v - z) / tau"}},
+}
+
+
+@pytest.mark.parametrize("name", BY_FORMULA)
+def test_the_model_beside_the_rig_runs_its_effects_by_formula(name):
+    size = {"unit": "rad" if name == "theta" else "-", "default": 0.1, "low": 0.0, "high": 1.0}
+    tau = {"tau": {"unit": "s", "default": 0.05, "low": 0.01, "high": 1.0}} if name == "memory" else {}
+    effect_file.define({"written": {**BY_FORMULA[name], "parameters": {"k": size, **tau}}}, "test")
+    model = load("bench").with_effects({"written": {"k": 0.1, "tau": 0.05}})
+    duty = Excitation(duration=10.0, seed=4).series()
+    read, _ = Rig(model, seed=2).run(duty)
+    companion = Companion(model, [])
+    parts = [companion.step(Samples(*read[:, k:k + STEP], duty[k:k + STEP])) for k in range(0, len(duty), STEP)]
+    effect_file.forget("written")
+    left = {CHANNELS[c]: np.concatenate([p.rows[stage][p.channel[stage] == c, 0] for p in parts[80:]])
+            for stage, c in (("actuator", 0), ("motor", 1), ("arm", 3))}
+    said = np.concatenate([np.array(p.said) for p in parts], axis=1)
+    free = {c: (read[k] - said[k]) / companion.floors[c] for k, c in enumerate(Samples._fields[:4]) if c != "omega"}
+    for channel, rows in left.items():  # the motor is fed with a voltage that has noise: its current has some more
+        assert np.sqrt(np.mean(rows ** 2)) < 1.3, channel
+        assert np.sqrt(np.mean(free[channel] ** 2)) < 1.1, channel
 
 
 def test_an_effect_is_named_only_if_it_is_more_likely_than_not():

@@ -13,7 +13,7 @@ from aeropend_sim.model.effects import DEFINED
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, load
 from aeropend_sim.model.rig import record
 from aeropend_sim.model.state import State
-from aeropend_sim.model.terms import along, series, terms
+from aeropend_sim.model.terms import SLOTS, along, series, terms
 
 BENCH = load("bench")
 DUTY = np.repeat(np.random.default_rng(3).uniform(0.1, 0.6, 8), 500)
@@ -114,6 +114,13 @@ def test_the_simulation_agrees_with_an_integrator_of_scipy(id_):
     t = np.arange(1500) * SAMPLE_PERIOD
     exact = solve_ivp(slope, (0.0, t[-1]), [1.0, 0.0, 0.0], "Radau", t, rtol=1e-9, atol=1e-11).y
     assert np.abs(found.theta - exact[0]).max() < 2e-5
+
+
+def test_a_series_in_parts_is_the_whole_series():
+    effects, rate, memory = with_("relaxing_hose", "rising").effects, np.sin(np.arange(1000) * 0.01), np.zeros(SLOTS)
+    parts = [series(effects, "arm", 250, 1e-3, k * 1e-3, memory, theta_dot=rate[k:k + 250])
+             for k in range(0, 1000, 250)]
+    assert np.concatenate(parts) == pytest.approx(series(effects, "arm", 1000, 1e-3, theta_dot=rate), abs=1e-12)
 
 
 def test_a_run_in_parts_is_the_whole_run():

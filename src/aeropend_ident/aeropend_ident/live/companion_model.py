@@ -30,9 +30,10 @@ from aeropend_sim.compiled import njit
 from aeropend_sim.model import actuator, dynamics, sensing
 from aeropend_sim.model.arm import advance_arm
 from aeropend_sim.model.coefficients import prepare
-from aeropend_sim.model.motor import advance_motor
+from aeropend_sim.model.motor import advance_motor, at_terminals
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 from aeropend_sim.model.state import State, since
+from aeropend_sim.model.terms import SLOTS, terms
 
 Array = NDArray[np.float64]
 
@@ -126,13 +127,12 @@ class _Members:
 
 
 @njit(nogil=True)
-def _motor(v: Array, i_a: Array, omega: Array, states: Any, c: Any, e: Any, x: Any, chain: Any, added: Any, ring: Array,
+def _motor(v: Array, omega: Array, states: Any, c: Any, e: Any, x: Any, chain: Any, added: Any, ring: Array,
            memory: Array, current: Array, pulse: Array, noise_of: Array, speed: Array) -> tuple[int, int]:
     """Advance the motors of a stage by N samples.
 
     Args:
-        v: (N + 1,) [V] voltage read, the sample before first.
-        i_a: (N,) [A] current read.
+        v: (N + 1, M) [V] voltage at the terminals by the reading, the sample before first.
         omega: (N,) [rad/s] speed read.
         states: of `_Members`.
         c: of `_Members`.
@@ -143,7 +143,7 @@ def _motor(v: Array, i_a: Array, omega: Array, states: Any, c: Any, e: Any, x: A
         ring: (M, TURNS) [rad] angles of the rotors at the last samples.
         memory: samples so far, last speed read, instant of the last pulse [s], is it known, last three errors [rad/s],
             was the last speed missing.
-        current: (N, M), filled with the residuals of the current [A].
+        current: (N, M), filled with the current [A].
         pulse: (N, M), filled with the residuals of the mean speed [rad/s]; NaN where no pulse came.
         noise_of: (N,), filled with the noise of the mean speed [rad/s].
         speed: (N,), filled with the speed that drives the arm [rad/s].
@@ -151,7 +151,7 @@ def _motor(v: Array, i_a: Array, omega: Array, states: Any, c: Any, e: Any, x: A
     Returns:
         False captures, and pulses.
     """
-    n, size = i_a.shape[0], current.shape[1]
+    n, size = current.shape
     h = chain[0].h
     step = 2.0 * math.pi / chain[0].pulses if chain[0].pulses > 0.0 else 0.0
     spikes = pulses = 0
@@ -159,18 +159,17 @@ def _motor(v: Array, i_a: Array, omega: Array, states: Any, c: Any, e: Any, x: A
         count = int(memory[0])
         now = count * h
         for j in range(size):
-            bias = chain[j].voltage_bias
-            s = states[j]
+            s, held = states[j], v[k, j]
             for _ in range(c[j].steps):
-                past = None if added is None else dynamics.pasts(s, v[k] - bias, c[j], added)
-                i1, _, w1, angle, heat = advance_motor(s, v[k] - bias, past, c[j], e[j], x[j], added)
+                past = None if added is None else dynamics.pasts(s, held, c[j], added)
+                i1, _, w1, angle, heat = advance_motor(s, held, past, c[j], e[j], x[j], added)
                 after = State(i1, w1, angle, 0.0, 0.0, 0.0, heat, 0.0, 0.0, 0.0, s.time, s.memory)
                 if added is not None and past is not None:
-                    after = since(after, dynamics.past_after(s, after, v[k] - bias, past, c[j], added))
+                    after = since(after, dynamics.past_after(s, after, held, past, c[j], added))
                 s = after
             states[j] = s
             ring[j, count % ring.shape[1]] = s.rotor_angle
-            current[k, j] = i_a[k] - (chain[j].current_factor * s.i_a + chain[j].current_bias)
+            current[k, j] = s.i_a
             pulse[k, j] = math.nan
         reading, before = omega[k], memory[1]
         noise_of[k] = 1.0
@@ -244,13 +243,14 @@ def _turned(ring: Array, j: int, t: float, count: int, h: float) -> float:
 
 
 @njit(nogil=True)
-def _arm(theta: Array, speed: Array, gains: Array, helped: NDArray[np.bool_], stages: Array, states: Any, c: Any,
-         e: Any, x: Any, chain: Any, added: Any, out: Array) -> None:
+def _arm(theta: Array, speed: Array, start: float, gains: Array, helped: NDArray[np.bool_], stages: Array, states: Any,
+         c: Any, e: Any, x: Any, chain: Any, added: Any, wrong: Any, out: Array) -> None:
     """Advance the observers of the arm by N samples.
 
     Args:
         theta: (N,) [rad] angle read.
         speed: (N + 1,) [rad/s] speed of the rotor, the sample before first.
+        start: [s] time of the first sample.
         gains: (3,) of the observer: [1], [1/s], and [1/s²] of its torque.
         helped: (M,) which of them get the missing torque; the second estimates it.
         stages: (M, 2) states of the angle's filter.
@@ -260,6 +260,7 @@ def _arm(theta: Array, speed: Array, gains: Array, helped: NDArray[np.bool_], st
         x: of `_Members`.
         chain: of `_Members`.
         added: of `_Members`.
+        wrong: errors of the angle by formula; None without any.
         out: (N, M), filled with the innovations [rad].
     """
     n, size = theta.shape[0], out.shape[1]
@@ -281,8 +282,7 @@ def _arm(theta: Array, speed: Array, gains: Array, helped: NDArray[np.bool_], st
                 if added is not None and past is not None:
                     after = since(after, dynamics.past_after(now, after, 0.0, past, c[j], added))
                 s = after
-            held = sensing.Memory(stages[j, 0], stages[j, 1], before.theta, before.theta_dot, 0.0, 0.0, 0.0, 0.0, 0.0)
-            first, second = sensing.filter_angle(held, s.theta, s.theta_dot, chain[j])
+            first, second = _read(stages[j], before, s, start + (k - 1) * chain[j].h, chain[j], wrong)
             error = theta[k] - second
             out[k, j] = error
             if math.isnan(error):
@@ -294,24 +294,33 @@ def _arm(theta: Array, speed: Array, gains: Array, helped: NDArray[np.bool_], st
 
 
 @njit(nogil=True)
-def _free(v: Array, states: Any, c: Any, e: Any, x: Any, chain: Any, added: Any, stages: Array, out: Array) -> None:
-    """Advance the whole chain by N holds of the voltage; out (4, N) gets θ, ω, i_a read and v_a at the terminals."""
+def _read(stages: Array, before: State, after: State, t: float, chain: Any, wrong: Any) -> tuple[float, float]:
+    """Both stages of the angle's filter [rad] after a sample, from those and the state before it, at time t [s]."""
+    theta, rate = sensing.seen_with_errors(before.theta, before.theta_dot, t, wrong)
+    held = sensing.Memory(stages[0], stages[1], theta, rate, 0.0, 0.0, 0.0, 0.0, 0.0)
+    theta, rate = sensing.seen_with_errors(after.theta, after.theta_dot, t + chain.h, wrong)
+    return sensing.filter_angle(held, theta, rate, chain)
+
+
+@njit(nogil=True)
+def _free(v: Array, start: float, states: Any, c: Any, e: Any, x: Any, chain: Any, added: Any, wrong: Any,
+          stages: Array, out: Array) -> None:
+    """Advance the whole chain by N holds of the voltage; out (4, N) gets θ read, ω, i_a, and v_a at the terminals."""
     for k in range(out.shape[1]):
         s = states[0]
         out[0, k] = stages[0, 1]
         out[1, k] = s.omega
-        out[2, k] = chain[0].current_factor * s.i_a + chain[0].current_bias
-        out[3, k] = v[k] - e[0].supply_sag_r_supply * s.i_a + chain[0].voltage_bias
+        out[2, k] = s.i_a
+        out[3, k] = at_terminals(v[k], s, e[0], added)
         before = s
         for _ in range(c[0].steps):
             s = dynamics.advance(s, v[k], c[0], e[0], x[0], added)
-        held = sensing.Memory(stages[0, 0], stages[0, 1], before.theta, before.theta_dot, 0.0, 0.0, 0.0, 0.0, 0.0)
-        stages[0, 0], stages[0, 1] = sensing.filter_angle(held, s.theta, s.theta_dot, chain[0])
+        stages[0, 0], stages[0, 1] = _read(stages[0], before, s, start + k * chain[0].h, chain[0], wrong)
         states[0] = s
 
 
 class Companion:
-    """The model of a rig beside its samples.
+    """The model of a rig beside its samples, with all its effects, whose time and memories begin at the first sample.
 
     Args:
         model: the nominal model.
@@ -325,8 +334,11 @@ class Companion:
         models = {stage: [model, *(c.model(model) for c in own)] for stage, own in self.columns.items()}
         self._actuators = models["actuator"]
         self._numbers = [m.numbers() for m in self._actuators]
-        behind = [actuator.behind_terminals(m) for m in models["motor"]]
-        self._motor = _Members(behind, period)
+        self._motors = [actuator.behind_terminals(m) for m in models["motor"]]
+        self._motor = _Members(self._motors, period)
+        biases = np.array([m.effect("voltage_offset", "bias") for m in self._motors])
+        self._biases = biases - biases[0]
+        self._wrong = terms(model.effects, ("theta",))
         self._arm = _Members([model, *models["arm"]], period)
         self._helped = np.array([False, True, *(not c.sticks for c in self.columns["arm"])])
         self._chain = _Members([model], period)
@@ -355,18 +367,19 @@ class Companion:
         numbers = self.model.numbers()
         theta, omega, i_a = first(s.theta), first(s.omega), first(s.i_a)
         duty = first(s.duty)
-        zero = self.model.effect("angle_offset", "bias")
+        at = sensing.true_angle(self.model, theta)
         thrust = float(actuator.thrust(numbers, omega))
         self._past = np.full(self._history, duty)
         self._count = 0
+        self._memories = np.zeros((len(self._actuators), SLOTS))
         self._last_v = first(s.v_a, float(actuator.voltage(numbers, duty)))
         self._last_i, self._last_speed, self._last_off = i_a, omega, 0.0
         self._motor.start(State(i_a=i_a, omega=omega))
         self._ring = np.zeros((len(self._motor.states), TURNS))
         self._memory = np.zeros(8)
         self._memory[1] = omega
-        self._arm.start(State(omega=omega, theta=theta - zero, thrust=thrust))
-        self._chain.start(State(i_a=i_a, omega=omega, theta=theta - zero, thrust=thrust))
+        self._arm.start(State(omega=omega, theta=at, thrust=thrust))
+        self._chain.start(State(i_a=i_a, omega=omega, theta=at, thrust=thrust))
         self._stages = np.full((len(self._arm.states), 2), theta)
         self._free_stages = np.full((1, 2), theta)
         self.running = True
@@ -384,12 +397,16 @@ class Companion:
         i_a = _held(samples.i_a, self._last_i)
         known = np.concatenate([self._past, duty])
         start = self._count - len(self._past)
-        volts, acting = [], np.zeros(n)
-        for m, numbers in zip(self._actuators, self._numbers, strict=True):
-            acts, read = (x[len(self._past):] for x in actuator.voltages(numbers, known, m.effects, self.period, start))
+        time = self.period * np.arange(self._count - 1, self._count + n)  # the sample before first
+        now = float(time[1])
+        volts, acting, more = [], np.zeros(n), np.zeros(n)
+        for m, numbers, memory in zip(self._actuators, self._numbers, self._memories, strict=True):
+            held, sampled = (x[len(self._past):] for x in actuator.voltages(numbers, known, m.effects, self.period,
+                                                                            start))
             if m is self.model:
-                acting = acts
-            volts.append(sensing.read_voltage(m, actuator.terminal_voltage(m, read, i_a, self.period)))
+                acting, more = held, sampled - held
+            loaded = actuator.terminal_voltage(m, sampled, i_a, self.period, now, memory)
+            volts.append(sensing.read_voltage(m, loaded, time[1:]))
         self._past = known[-self._history:]
         v_rows = (samples.v_a[:, None] - np.array(volts).T) / self._noise[0]
         off = _held(samples.v_a - volts[0], self._last_off)
@@ -397,26 +414,31 @@ class Companion:
 
         size = len(self._motor.states)
         current, pulse, noise_of, speed = np.empty((n, size)), np.empty((n, size)), np.empty(n), np.empty(n)
+        seen = v[:, None] - self._biases
+        true = sensing.true_voltage(self.model, seen, np.broadcast_to(time[:, None], seen.shape))
         o = self._motor
-        spikes, pulses = _motor(v, samples.i_a, samples.omega, o.states, o.c, o.e, o.x, o.chain, o.added, self._ring,
+        spikes, pulses = _motor(true, samples.omega, o.states, o.c, o.e, o.x, o.chain, o.added, self._ring,
                                 self._memory, current, pulse, noise_of, speed)
-        current /= self._noise[1]
+        read = [sensing.read_current(m, current[:, j], time[1:]) for j, m in enumerate(self._motors)]
+        i_rows = (samples.i_a[:, None] - np.array(read).T) / self._noise[1]
         pulse /= noise_of[:, None]
 
         out = np.empty((n, len(self._arm.states)))
         a = self._arm
-        _arm(samples.theta, np.concatenate([[self._last_speed], speed]), self._gains, self._helped, self._stages,
-             a.states, a.c, a.e, a.x, a.chain, a.added, out)
+        _arm(samples.theta, np.concatenate([[self._last_speed], speed]), now, self._gains, self._helped, self._stages,
+             a.states, a.c, a.e, a.x, a.chain, a.added, self._wrong, out)
         beside = np.where(self._helped, out[:, 1:2], out[:, :1])
         innovation = (out[:, :1] + (out - beside)[:, [0, *range(2, out.shape[1])]]) / self._noise[3]
 
         said = np.empty((4, n))
         f = self._chain
-        _free(acting, f.states, f.c, f.e, f.x, f.chain, f.added, self._free_stages, said)
+        _free(acting, now, f.states, f.c, f.e, f.x, f.chain, f.added, self._wrong, self._free_stages, said)
+        said[2] = sensing.read_current(self.model, said[2], time[1:])
+        said[3] = sensing.read_voltage(self.model, said[3] + more, time[1:])
         self._count += n
         self._last_off = float(off[-1])
         self._last_v, self._last_i, self._last_speed = float(v[-1]), float(i_a[-1]), float(speed[-1])
-        rows = {"actuator": _rows((v_rows, 0)), "motor": _rows((current, 1), (pulse, 2)), "arm": _rows((innovation, 3))}
+        rows = {"actuator": _rows((v_rows, 0)), "motor": _rows((i_rows, 1), (pulse, 2)), "arm": _rows((innovation, 3))}
         return Residuals({k: r[0] for k, r in rows.items()}, {k: r[1] for k, r in rows.items()},
                          {k: r[2] for k, r in rows.items()}, spikes, pulses,
                          Samples(said[0], said[1], said[2], said[3], duty))

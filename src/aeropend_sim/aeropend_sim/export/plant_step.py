@@ -98,8 +98,6 @@ def begin(theta: float, k: Known) -> Rig:
 
 def see(plant: State, t: float, k: Known) -> tuple[float, float]:
     """Angle and rate that the encoder sees after a time (s)."""
-    if k.wrong_angle is None:
-        return plant.theta, plant.theta_dot
     return sensing.seen_with_errors(plant.theta, plant.theta_dot, t, k.wrong_angle)
 
 

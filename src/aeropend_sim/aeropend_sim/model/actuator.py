@@ -228,8 +228,8 @@ def at_bridge(v: ArrayLike, time: ArrayLike, effects: Mapping[str, Mapping[str, 
     return acts
 
 
-def terminal_voltage(model: Model, voltage: ScalarOrArray, current: ScalarOrArray, period: float = SAMPLE_PERIOD
-                     ) -> ScalarOrArray:
+def terminal_voltage(model: Model, voltage: ScalarOrArray, current: ScalarOrArray, period: float = SAMPLE_PERIOD,
+                     start: float = 0.0, memory: Array | None = None) -> ScalarOrArray:
     """Voltage at the motor's terminals.
 
     Args:
@@ -237,6 +237,8 @@ def terminal_voltage(model: Model, voltage: ScalarOrArray, current: ScalarOrArra
         voltage: [V] scalar or (N,) voltage at the bridge without load, from `acting_voltage` or `sampled_voltage`.
         current: [A] armature current, in the same shape.
         period: [s] time between samples.
+        start: [s] time of the first sample, for formulas.
+        memory: states of the effects with a memory, for a series in parts; as for `terms.series`.
 
     Returns:
         [V] v - r_supply i, in the same shape; (N,) with effects by formula.
@@ -244,7 +246,8 @@ def terminal_voltage(model: Model, voltage: ScalarOrArray, current: ScalarOrArra
     loaded = voltage - model.effect("supply_sag", "r_supply") * current
     if any(DEFINED[id_].term and DEFINED[id_].place == "actuator" for id_ in model.effects if id_ in DEFINED):
         v, i = np.broadcast_arrays(np.atleast_1d(voltage), np.atleast_1d(current))
-        loaded = loaded + series(model.effects, "actuator", len(v), period, v=v, i_a=i)  # type: ignore[assignment]
+        loaded = loaded + series(  # type: ignore[assignment]
+            model.effects, "actuator", len(v), period, start, memory, v=v, i_a=i)
     return loaded
 
 

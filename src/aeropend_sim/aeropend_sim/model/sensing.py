@@ -25,7 +25,7 @@ from aeropend_sim.model.terms import EMPTY, Quantities, Terms, series, term_sum,
 Array = NDArray[np.float64]
 
 REPEATED = 20
-"""Rounds of the fixed point that takes the error out of a voltage. A choice: an error of 30 % falls to 1e-10."""
+"""Rounds of the fixed point that takes the error out of a reading. A choice: an error of 30 % falls to 1e-10."""
 
 AHEAD = 1e-4
 """[s] Time over which the rate of an error of the angle is taken (a choice: far below a sample)."""
@@ -131,9 +131,9 @@ def true_voltage(model: Model, reading: ScalarOrArray, time: NDArray[np.floating
     """The inverse of `read_voltage`.
 
     Args:
-        model: its effect `voltage_offset` acts.
-        reading: [V] scalar or (N,) voltage read.
-        time: [s] of it, for formulas that depend on it.
+        model: its effect `voltage_offset` acts, and its effects by formula.
+        reading: [V] scalar or array of voltages read.
+        time: [s] of each, for formulas that depend on it.
 
     Returns:
         [V] v - bias, in the shape of `reading`.
@@ -151,7 +151,7 @@ def _error(model: Model, channel: str, time: NDArray[np.floating[Any]] | float, 
     if channel not in readings_with_errors(model):
         return 0.0  # type: ignore[return-value]
     (value,) = known.values()
-    found = series(model.effects, channel, np.size(value), 0.0, t=np.ravel(time),
+    found = series(model.effects, channel, np.size(value), 0.0, 0.0, None, t=np.ravel(time),
                    **{name: np.ravel(x) for name, x in known.items()})
     return found.reshape(np.shape(value)) if np.ndim(value) else float(found[0])  # type: ignore[return-value]
 
@@ -187,15 +187,17 @@ def angle_error(theta: float, theta_dot: float, t: float, wrong: Terms) -> float
 
 
 @equation
-def seen_with_errors(theta: float, theta_dot: float, t: float, wrong: Terms) -> tuple[float, float]:
+def seen_with_errors(theta: float, theta_dot: float, t: float, wrong: Terms | None) -> tuple[float, float]:
     """As `seen_angle`, at one instant.
 
     Args:
         theta: [rad] true angle.
         theta_dot: [rad/s] true rate.
         t: [s] time.
-        wrong: errors of the angle.
+        wrong: errors of the angle; None without any.
     """
+    if wrong is None:
+        return theta, theta_dot
     later = angle_error(theta + AHEAD * theta_dot, theta_dot, t + AHEAD, wrong)
     earlier = angle_error(theta - AHEAD * theta_dot, theta_dot, t - AHEAD, wrong)
     return theta + angle_error(theta, theta_dot, t, wrong), theta_dot + (later - earlier) / (2.0 * AHEAD)
@@ -214,6 +216,21 @@ def read_angle(model: Model, theta: Array, theta_dot: Array, period: float = SAM
         (N,) [rad] output of the encoder and its filter.
     """
     return angle_reading(*seen_angle(model, theta, theta_dot, period), prepare(model, period))
+
+
+def true_angle(model: Model, reading: float, time: float = 0.0) -> float:
+    """[rad] Angle at which an arm that has long been at rest gives a reading, without noise and quantisation.
+
+    Args:
+        model: sensing parameters and effects.
+        reading: [rad] of the angle.
+        time: [s] of it, for formulas that depend on it.
+    """
+    chain, true = prepare(model), reading
+    for _ in range(REPEATED):
+        seen, _rate = seen_angle(model, np.array([true]), np.zeros(1), chain.h, time)
+        true += reading - encoder_angle(float(seen[0]), chain)
+    return true
 
 
 def filter_stages(model: Model) -> tuple[float, float]:

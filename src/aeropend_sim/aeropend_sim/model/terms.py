@@ -226,8 +226,8 @@ def remembered(memory: Memory, near: Memory, q: Quantities, h: float, x: Terms) 
 
 
 @njit(nogil=True, error_model="numpy")
-def _series(values: Array, h: float, x: Terms, out: Array) -> None:
-    memory = (0.0, 0.0, 0.0, 0.0)
+def _series(values: Array, h: float, x: Terms, held: Array, out: Array) -> None:
+    memory = (held[0], held[1], held[2], held[3])
     for k in range(values.shape[1]):
         q = Quantities(values[0, k], values[1, k], values[2, k], values[3, k], values[4, k], values[5, k],
                        values[6, k])
@@ -235,9 +235,11 @@ def _series(values: Array, h: float, x: Terms, out: Array) -> None:
         if x.memories > 0:
             middle = remembered(memory, memory, q, 0.5 * h, x)
             memory = remembered(memory, middle, q, h, x)
+    held[0], held[1], held[2], held[3] = memory
 
 
-def series(effects: Mapping[str, Mapping[str, float]], place: str, count: int, period: float, **known: Array) -> Array:
+def series(effects: Mapping[str, Mapping[str, float]], place: str, count: int, period: float, start: float = 0.0,
+           memory: Array | None = None, **known: Array) -> Array:
     """Sum of the terms at a place over a recording, from quantities at its samples.
 
     Args:
@@ -245,13 +247,16 @@ def series(effects: Mapping[str, Mapping[str, float]], place: str, count: int, p
         place: of the chain, or the reading of terms at place `sensing`.
         count: N, number of samples.
         period: [s] time between samples.
-        **known: quantities by name, (N,) each or scalar; the others are 0, the time from 0 on.
+        start: [s] time of the first sample.
+        memory: (SLOTS,) states of the effects with a memory at the first sample; afterwards those for the sample after
+            the last. None: from 0 on.
+        **known: quantities by name, (N,) each or scalar; the others are 0, the time from `start` on.
 
     Returns:
         (N,) sum.
     """
     x = terms(effects, (place,))
-    return np.zeros(count) if x is None else _along(x, count, period, known)
+    return np.zeros(count) if x is None else _along(x, count, period, known, start, memory)
 
 
 def along(text: str, parameters: Mapping[str, float], count: int, period: float, memory: str = "", rate: str = "",
@@ -276,9 +281,10 @@ def along(text: str, parameters: Mapping[str, float], count: int, period: float,
                   known)
 
 
-def _along(x: Terms, count: int, period: float, known: Mapping[str, Array]) -> Array:
+def _along(x: Terms, count: int, period: float, known: Mapping[str, Array], start: float = 0.0,
+           memory: Array | None = None) -> Array:
     values, out = np.zeros((len(QUANTITIES), count)), np.zeros(count)
     for row, name in zip(values, QUANTITIES, strict=True):
-        row[:] = known.get(name, np.arange(count) * period if name == "t" else 0.0)
-    _series(values, period, x, out)
+        row[:] = known.get(name, start + np.arange(count) * period if name == "t" else 0.0)
+    _series(values, period, x, np.zeros(SLOTS) if memory is None else memory, out)
     return out
