@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from aeropend_control.laws.observer import Observer
-from aeropend_sim.model.effects import CATALOGUE
+from aeropend_sim.model import effect_file
+from aeropend_sim.model.effects import CATALOGUE, DEFINED
 from aeropend_sim.model.parameters import load
 from aeropend_sim.model.rig import Rig
 
@@ -15,10 +16,18 @@ FORESEEN = [id_ for id_ in CATALOGUE if id_ != "gust" and id_ not in NOT_OF_THE_
 
 
 def defaults(effect):
-    return {effect: {name: p.default for name, p in CATALOGUE[effect].parameters.items()}}
+    return {effect: {name: p.default for name, p in DEFINED[effect].parameters.items()}}
 
 
-@pytest.mark.parametrize("effect", ["none", *FORESEEN])
+effect_file.define({
+    "angle_by_formula": {"place": "sensing", "reading": "theta", "term": "k * cos(3 * theta) * (1 + step(t - 2))",
+                         "parameters": {"k": {"unit": "rad", "default": 0.03, "low": 0.0, "high": 1.0}}},
+    "current_by_formula": {"place": "sensing", "reading": "i_a", "term": "k * abs(i_a) * (1 + step(t - 2))",
+                           "parameters": {"k": {"unit": "-", "default": 0.3, "low": 0.0, "high": 1.0}}},
+}, "test_observer")
+
+
+@pytest.mark.parametrize("effect", ["none", "angle_by_formula", *FORESEEN])
 def test_the_observer_finds_angle_and_rate(effect):
     model = BENCH.with_effects({} if effect == "none" else defaults(effect))
     rig, observer = Rig(model, 3), Observer(model)
@@ -53,6 +62,19 @@ def test_a_start_from_any_angle():
     e = model.effects["encoder_eccentricity"]
     read = observer.state.theta + 0.06 + e["amplitude"] * math.sin(observer.state.theta + e["phase"])
     assert read == pytest.approx(0.7, abs=1e-3)
+
+
+def test_a_start_from_an_angle_whose_reading_is_wrong_by_a_formula():
+    observer = Observer(BENCH.with_effects(defaults("angle_by_formula")))
+    observer.step(0.7, 0.0)
+    assert observer.state.theta + 0.03 * math.cos(3 * observer.state.theta) == pytest.approx(0.7, abs=1e-3)
+
+
+def test_an_error_of_the_current_by_formula_is_no_bias():
+    model = BENCH.with_effects(defaults("current_by_formula"))
+    observer = Observer(model, motor=True)
+    speeds(observer, Rig(model, 1), [0.5] * 2000)
+    assert abs(observer.current_bias) < 0.01
 
 
 def speeds(observer, rig, duties):

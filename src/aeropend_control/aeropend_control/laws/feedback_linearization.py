@@ -5,8 +5,8 @@ With the thrust f = (J/L)((mgd/J) sin y + v) the plant from v to the angle is 1/
 its output is v. The law has three parts:
 
 - The observer (`observer`) runs the model and corrects it by each reading of the angle. So it accounts for the angle
-  filter, quantisation and noise, for `angle_offset`, `encoder_eccentricity`, `encoder_lag` and `command_delay`, and for
-  every effect between the duty and the angle.
+  filter, quantisation and noise, for `angle_offset`, `encoder_eccentricity`, `encoder_lag`, `command_delay` and errors
+  of the angle by formula, and for every effect between the duty and the angle.
 - The law compensates gravity, `cable_torque`, `quadratic_drag` and `axial_inflow` (the terms of `arm_drive`
   without thrust and viscous friction), `coulomb_friction` and `ground_effect`. Only the observer accounts for
   `mast_flex`. With a `command_delay` the law uses the predicted state at the time when the duty acts.

@@ -18,7 +18,7 @@ from aeropend_sim.model.coefficients import Coefficients, Extra, prepare
 from aeropend_sim.model.effects import Values
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 from aeropend_sim.model.state import Motion, Past, State
-from aeropend_sim.model.terms import Terms
+from aeropend_sim.model.terms import Terms, terms
 
 Array = NDArray[np.float64]
 
@@ -114,6 +114,7 @@ class Observer:
         assert x is not None
         self.plant = c, e, x, added
         self._chain = sensing.prepare(model, period)
+        self._wrong_angle, self._wrong_current = (terms(model.effects, (reading,)) for reading in ("theta", "i_a"))
         self._gain = _kalman(self._chain, self.numbers["c_over_J"], period)
         n = self.numbers
         self._per_volt = n["K_t"] / (n["R_a"] * n["B_m"] + n["K_e"] * n["K_t"])  # rad/s, without load
@@ -165,20 +166,21 @@ class Observer:
         self._queue.append(self._voltage(duty))
         volts = np.array(self._queue)
         self._queue.popleft()
+        now = self.count * self.period
         self.count += 1
         if self.motor:
-            self.state, self._motor = _correct_motor(omega, i_a, self.state, self._motor, self._angles, self._chain,
-                                                     self._per_volt)
+            self.state, self._motor = _correct_motor(omega, i_a, now, self.state, self._motor, self._angles,
+                                                     self._chain, self._wrong_current, self._per_volt)
             volts = np.maximum(volts + self._motor.voltage, 0.0)
-        self.state, self._memory, estimate = _observe(theta, volts, self.state, self._memory, self._gain, self._chain,
-                                                      *self.plant)
+        self.state, self._memory, estimate = _observe(theta, now, volts, self.state, self._memory, self._gain,
+                                                      self._chain, self._wrong_angle, *self.plant)
         return Estimate(*estimate)
 
     def _start(self, theta: float) -> State:
-        angle = 0.0 if math.isnan(theta) else theta
-        for _ in range(8):  # fixed-point iteration: the encoder's error depends slightly on the angle
-            self._memory = sensing.start(angle, 0.0, 0.0, 0.0, self._chain)
-            angle += 0.0 if math.isnan(theta) else theta - self._memory.stage2
+        now = self.count * self.period
+        angle = 0.0 if math.isnan(theta) else sensing.true_angle(self.model, theta, now)
+        seen, rate = sensing.seen_angle(self.model, np.array([angle]), np.zeros(1), self.period, now)
+        self._memory = sensing.start(float(seen[0]), float(rate[0]), 0.0, 0.0, self._chain)
         return dynamics.steady(self.model, self._duty)._replace(theta=angle)
 
     def _voltage(self, duty: float) -> float:
@@ -189,21 +191,23 @@ class Observer:
 
 
 @njit(nogil=True)
-def _observe(theta: float, volts: Array, s: State, m: sensing.Memory, gain: Array,
-             chain: sensing.MeasurementChain, c: Coefficients, e: Values | None, x: Extra | None,
+def _observe(theta: float, t: float, volts: Array, s: State, m: sensing.Memory, gain: Array,
+             chain: sensing.MeasurementChain, wrong: Terms | None, c: Coefficients, e: Values | None, x: Extra | None,
              added: Terms | None) -> tuple[State, sensing.Memory, tuple[State, float, float, float]]:
-    """Correct the state by a reading, advance it by the first voltage, and predict it over the other voltages."""
+    """Correct the state by a reading of time t [s], advance it by the first voltage, and predict it over the others."""
     if not math.isnan(theta):
         error = theta - m.stage2
         y, rate = s.theta + gain[0] * error, s.theta_dot + gain[1] * error
         s = State(s.i_a, s.omega, s.rotor_angle, y, rate, s.thrust, s.heat, s.flex, s.flex_dot,
                   s.gust + gain[2] * error, s.time, s.memory)
+        y, rate = sensing.seen_with_errors(y, rate, t, wrong)
         m = sensing.Memory(m.stage1 + gain[3] * error, m.stage2 + gain[4] * error, y, rate, m.omega, m.rotor_angle,
                            m.last_pulse, m.speed, m.time)
     scratch, silent = np.empty((7, len(volts))), np.zeros(len(volts))
     s = dynamics.run(volts[:1], silent, s, c, e, x, added, scratch)
-    stage1, stage2 = sensing.filter_angle(m, s.theta, s.theta_dot, chain)
-    m = sensing.Memory(stage1, stage2, s.theta, s.theta_dot, m.omega, m.rotor_angle, m.last_pulse, m.speed, m.time)
+    y, rate = sensing.seen_with_errors(s.theta, s.theta_dot, t + chain.h, wrong)
+    stage1, stage2 = sensing.filter_angle(m, y, rate, chain)
+    m = sensing.Memory(stage1, stage2, y, rate, m.omega, m.rotor_angle, m.last_pulse, m.speed, m.time)
     p = dynamics.run(volts[1:], silent, s, c, e, x, added, scratch) if len(volts) > 1 else s
     sine, motion = math.sin(p.theta), Motion(p.theta, p.theta_dot, 0.0, 0.0)
     drive = arm_drive(sine, motion, 0.0, p.omega, 0.0, c, e)
@@ -214,14 +218,15 @@ def _observe(theta: float, volts: Array, s: State, m: sensing.Memory, gain: Arra
 
 
 @njit(nogil=True)
-def _correct_motor(omega: float, i_a: float, s: State, m: MotorCorrection, angles: Array,
-                   chain: sensing.MeasurementChain, per_volt: float) -> tuple[State, MotorCorrection]:
-    """State and correction after the readings of speed and current; `angles` (ring of samples) is updated."""
+def _correct_motor(omega: float, i_a: float, t: float, s: State, m: MotorCorrection, angles: Array,
+                   chain: sensing.MeasurementChain, wrong: Terms | None, per_volt: float
+                   ) -> tuple[State, MotorCorrection]:
+    """State and correction after the readings of speed and current at time t [s]; `angles` (a ring) is updated."""
     k = m.samples
     voltage, current, read, at_pulse, outliers = m.voltage, m.current, m.read, m.at_pulse, m.outliers
     angles[k % HISTORY] = s.rotor_angle
     if not math.isnan(i_a):
-        more = (i_a - chain.current_bias) / chain.current_factor - s.i_a
+        more = (i_a - chain.current_bias) / chain.current_factor - sensing.seen_current(s.i_a, t, wrong)
         current += (more - current) * -math.expm1(-chain.h / CURRENT_TIME)
     use, time, error = not math.isnan(omega), chain.h, omega - s.omega
     if use and chain.pulses > 0.0:

@@ -203,6 +203,20 @@ def seen_with_errors(theta: float, theta_dot: float, t: float, wrong: Terms | No
     return theta + angle_error(theta, theta_dot, t, wrong), theta_dot + (later - earlier) / (2.0 * AHEAD)
 
 
+@equation
+def seen_current(current: float, t: float, wrong: Terms | None) -> float:
+    """[A] Current that its sensor sees.
+
+    Args:
+        current: [A] true current.
+        t: [s] time.
+        wrong: errors of the current that are given by formulas; None without any.
+    """
+    if wrong is None:
+        return current
+    return current + term_sum(0, wrong.arm_friction, Quantities(0.0, 0.0, 0.0, 0.0, current, 0.0, t), EMPTY, wrong)
+
+
 def read_angle(model: Model, theta: Array, theta_dot: Array, period: float = SAMPLE_PERIOD) -> Array:
     """Reading of the angle before noise and quantisation.
 
@@ -228,8 +242,8 @@ def true_angle(model: Model, reading: float, time: float = 0.0) -> float:
     """
     chain, true = prepare(model), reading
     for _ in range(REPEATED):
-        seen, _rate = seen_angle(model, np.array([true]), np.zeros(1), chain.h, time)
-        true += reading - encoder_angle(float(seen[0]), chain)
+        seen, _ = seen_angle(model, np.array([true]), np.zeros(1), chain.h, time)
+        true += reading - start(float(seen[0]), 0.0, 0.0, 0.0, chain).stage2
     return true
 
 
