@@ -56,6 +56,24 @@ TURNS = 256
 SLACK = 0.6
 """Sample periods by which the instant of a pulse may miss the sample that shows it (choice: rounding of the tick)."""
 
+SPEED_ERROR = (1e-3, 1e-3)
+"""[-], [rad/s] Least noise of a speed that is sampled directly: a share of it, plus a value (choice: no sensor is
+exact)."""
+
+PULSE_ERROR = 2e-3
+"""Share of a mean speed over a pulse interval that is noise beside tick and sensor (choice: pulses are not quite evenly
+spaced, and the model's angle is taken straight between samples)."""
+
+STANDING = 50
+"""Samples between two comparisons with a speed that reads 0 (choice: 0.1 s, a tick of the detector)."""
+
+STANDS = 1.5
+"""Multiple of the slowest speed that can be read above which a model does not stand (choice: without a pulse in the
+timeout a rotor is slower than 1; half a pulse is margin)."""
+
+FREE_SPEED = 1.0
+"""[rad/s] Least floor of the free run's speed (choice: its reading is held between pulses, and so always late)."""
+
 CHANNELS = ("v_a", "i_a", "omega", "theta")
 """Channels, in the order of the chain."""
 
@@ -93,10 +111,12 @@ class Residuals:
 
 
 def noise(model: Model) -> dict[str, float]:
-    """Noise of a reading of each channel, with its resolution, SI units.
+    """Noise of a reading of each channel but the speed, with its resolution, SI units.
+
+    That of a speed depends on its pulse interval, see `_motor`.
 
     Args:
-        model: its sensing parameters. That of the speed is for the mean over a pulse interval.
+        model: its sensing parameters.
     """
     s = model.sensing
 
@@ -159,13 +179,13 @@ def _motor(v: Array, omega: Array, states: Any, c: Any, e: Any, x: Any, chain: A
         count = int(memory[0])
         now = count * h
         for j in range(size):
-            s, held = states[j], v[k, j]
+            s, volts = states[j], v[k, j]
             for _ in range(c[j].steps):
-                past = None if added is None else dynamics.pasts(s, held, c[j], added)
-                i1, _, w1, angle, heat = advance_motor(s, held, past, c[j], e[j], x[j], added)
+                past = None if added is None else dynamics.pasts(s, volts, c[j], added)
+                i1, _, w1, angle, heat = advance_motor(s, volts, past, c[j], e[j], x[j], added)
                 after = State(i1, w1, angle, 0.0, 0.0, 0.0, heat, 0.0, 0.0, 0.0, s.time, s.memory)
                 if added is not None and past is not None:
-                    after = since(after, dynamics.past_after(s, after, held, past, c[j], added))
+                    after = since(after, dynamics.past_after(s, after, volts, past, c[j], added))
                 s = after
             states[j] = s
             ring[j, count % ring.shape[1]] = s.rotor_angle
@@ -180,7 +200,7 @@ def _motor(v: Array, omega: Array, states: Any, c: Any, e: Any, x: Any, chain: A
         elif step == 0.0:  # a speed that is sampled directly
             for j in range(size):
                 pulse[k, j] = reading - states[j].omega
-            noise_of[k] = max(chain[0].speed_noise, 1e-3 * abs(reading) + 1e-3)
+            noise_of[k] = max(chain[0].speed_noise, SPEED_ERROR[0] * abs(reading) + SPEED_ERROR[1])
             _remember(memory, pulse[k, 0])
             pulses += 1
         elif reading != before and reading > 0.0:
@@ -205,15 +225,15 @@ def _motor(v: Array, omega: Array, states: Any, c: Any, e: Any, x: Any, chain: A
                     pulse[k, j] = reading - (end - begin) / interval
                 tick = chain[0].tick / math.sqrt(6.0)
                 noise_of[k] = math.sqrt((reading * tick / interval) ** 2 + chain[0].speed_noise ** 2
-                                        + (2e-3 * reading) ** 2)
+                                        + (PULSE_ERROR * reading) ** 2)
                 _remember(memory, pulse[k, 0])
                 pulses += 1
-        elif reading == 0.0 and count % 50 == 0 and now > sensing.SPEED_TIMEOUT:  # slower than a pulse in the timeout
+        elif reading == 0.0 and count % STANDING == 0 and now > sensing.SPEED_TIMEOUT:  # no pulse in the timeout
             slowest = step / sensing.SPEED_TIMEOUT
             back = int(sensing.SPEED_TIMEOUT / h)
             for j in range(size):
                 mean = (ring[j, count % ring.shape[1]] - ring[j, (count - back) % ring.shape[1]]) / (back * h)
-                pulse[k, j] = -max(mean - 1.5 * slowest, 0.0)
+                pulse[k, j] = -max(mean - STANDS * slowest, 0.0)
             noise_of[k] = 1.0
             memory[4] = memory[5] = memory[6] = pulse[k, 0]
             memory[3] = 0.0
@@ -351,7 +371,7 @@ class Companion:
         first = max(2.0 * OBSERVER_DAMPING * rate - damping, 0.0)
         second = max(rate * rate - gravity - damping * first, 0.0)
         self._gains = np.array([first, second, DISTURBANCE * rate**3]) * period
-        self.floors = {**noises, "omega": max(model.sensing["speed_noise"], 1.0)}
+        self.floors = {**noises, "omega": max(model.sensing["speed_noise"], FREE_SPEED)}
         self.running = False
 
     def restart(self) -> None:

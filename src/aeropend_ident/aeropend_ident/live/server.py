@@ -26,6 +26,7 @@ from aeropend_ident.live.companion_model import Residuals
 from aeropend_ident.live.intake import Batch, Intake
 from aeropend_ident.live.watcher import PARTED, Watcher
 from aeropend_sim.errors import UserError
+from aeropend_sim.model.parameters import SAMPLE_PERIOD
 
 FILES = Path(__file__).parent / "page"
 
@@ -87,17 +88,16 @@ class Page:
     Attributes:
         url: of the page.
         reference: last reference heard.
-        command: last duty heard.
 
     Raises:
         UserError: the address cannot be used.
     """
 
     def __init__(self, address: str, port: int, model: str) -> None:
-        self.reference = self.command = math.nan
+        self.reference = math.nan
         self._hello = {"model": model, "seconds": SHOWN_S}
         self._viewers: set[_Viewer] = set()
-        self._past: deque[list[Any]] = deque(maxlen=round(SHOWN_S * 490.2 / THINNED))
+        self._past: deque[list[Any]] = deque(maxlen=round(SHOWN_S / (SAMPLE_PERIOD * THINNED)))
         self._skip = 0
         self._history: deque[dict[str, Any]] = deque(maxlen=HISTORY)
         self._listed = 0  # number of the alarm that is last in it

@@ -218,8 +218,6 @@ class Watch(Node):
                     intake.armature(*wire.armature(data))
                 elif short == interface.DUTY_COMMAND:
                     intake.command = wire.read_float64(data)
-                    if self._page is not None:
-                        self._page.command = intake.command
                 elif short == interface.REFERENCE and self._page is not None:
                     self._page.reference = wire.read_float64(data)
                 elif short == interface.DIAGNOSTICS and self._page is not None:
