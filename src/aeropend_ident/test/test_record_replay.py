@@ -18,6 +18,7 @@ from aeropend_ident.nodes.replay import Plan, Replay
 from aeropend_ident.nodes.topic_recorder import TopicRecorder
 
 FLOAT = "std_msgs/msg/Float64"
+ROSOUT = ("/rosout", "rcl_interfaces/msg/Log")
 
 FEED = """
 '''Publish numbered samples at the sample rate, once somebody listens, and leave when all were delivered.'''
@@ -273,6 +274,22 @@ def test_duration_ends_the_recording(processes):
     assert recording.complete
     assert len(recording) > 400
     assert recording.received_ns[-1] - recording.received_ns[0] >= 0.95e9
+
+
+def test_duration_counts_from_the_rig_whatever_else_is_heard_before(processes):
+    recorder = record(processes, "bag", "all:=true", "duration:=0.5")
+    deadline, others = time.monotonic() + 60, []
+    while not others or others[-1] - others[0] < 2e9:  # ns; log lines and diagnostics
+        assert recorder.poll() is None, recorder.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+        bag = Bag(processes.folder / "bag")
+        others = sorted(received for _, received, _ in bag.messages()) if ROSOUT in counts(bag.path) else []
+    feeder = processes.start("100000", "/rig7", code=FEED)
+    status, said = processes.wait(recorder)
+    feeder.kill()
+    assert status == 0, said
+    assert len(read(processes.folder / "bag")) > 200
 
 
 def test_all_topics_end_at_once_however_slow_the_disk(processes):

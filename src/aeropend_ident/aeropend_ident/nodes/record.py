@@ -32,6 +32,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from aeropend_ident.bags.container import STORAGES
 from aeropend_ident.bags.msgtypes import learn
+from aeropend_ident.bags.recording import split_topic
 from aeropend_ident.bags.writer import PLUGINS, BagWriter
 from aeropend_ident.nodes.topic_recorder import TopicRecorder, qos_of
 from aeropend_sim.errors import UserError
@@ -135,7 +136,7 @@ class Record(Node):
             enable_rosout=False,
             start_parameter_services=False,
         )
-        self._first: float | None = None  # when the first message came, monotonic
+        self._first: float | None = None  # when the first message of the rig came, monotonic
         self._display = _Display(self, self._duration)
         self._diagnostics = Diagnostics(self, self._report)
         self._worker = Worker(self, self._record, "record")
@@ -207,8 +208,13 @@ class Record(Node):
             self._writer.write(recorder.connection, received or time.time_ns(), message)
             recorder.count += 1
             recorder.heard = time.monotonic()
-            if self._first is None and recorder.topic != interface.DIAGNOSTICS:  # every node publishes it all the time
+            if self._first is None and self._is_of_rig(recorder):
                 self._first = recorder.heard
+
+    def _is_of_rig(self, recorder: TopicRecorder) -> bool:
+        """Whether a rig sends this topic by itself, in any namespace: with `all` it may be any."""
+        split = split_topic(recorder.topic, recorder.msgtype)
+        return recorder.topic in self._sampled or (split is not None and split[1] in SAMPLED)
 
     def _connect(self, recorder: TopicRecorder) -> Connection:
         """Add a topic to the bag, with the QoS that its publishers offer."""
@@ -271,7 +277,7 @@ class Record(Node):
         return list(self._recorders.values())
 
     def elapsed(self, now: float) -> float:
-        """Return the time since the first message, s."""
+        """Return the time since the first message of the rig, s."""
         return now - self._first if self._first is not None else 0.0
 
     def shorten(self, topic: str) -> str:
