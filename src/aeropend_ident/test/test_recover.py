@@ -51,6 +51,20 @@ def test_a_broken_bag_becomes_a_proper_one(broken, tmp_path, capsys):
     assert contents(path) == before
 
 
+@pytest.mark.parametrize(("folder", "inside", "given", "made"), [
+    ("bag", True, ".", "bag_recovered"), ("bag", True, "..", "bag_recovered"),
+    ("2024.05.01_run", False, "2024.05.01_run", "2024.05.01_run_recovered"),
+    ("bag", True, "bag.1.mcap", "bag/bag.1_recovered")])
+def test_the_new_bag_has_the_name_of_the_old_one(broken, tmp_path, monkeypatch, folder, inside, given, made):
+    path = broken[0].rename(tmp_path / folder)
+    (path / "bag.mcap").rename(path / "bag.1.mcap")
+    (path / "metadata.yaml").unlink()
+    (path / "sub").mkdir()
+    monkeypatch.chdir(path / "sub" if given == ".." else path if inside else tmp_path)
+    assert main([given]) == 0
+    assert messages(tmp_path / made)
+
+
 def test_out_names_the_target_and_is_not_overwritten(broken, tmp_path, capsys):
     path, _ = broken
     assert main([str(path / "bag.mcap"), "--out", str(tmp_path / "saved")]) == 0

@@ -18,7 +18,7 @@ from rosbags.rosbag2.errors import WriterError
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from aeropend_ident.bags.container import Bag
+from aeropend_ident.bags.container import STORAGES, Bag
 from aeropend_ident.bags.msgtypes import learn
 from aeropend_ident.bags.reading import RecordingError
 from aeropend_ident.bags.writer import BagWriter
@@ -71,8 +71,8 @@ def recover(path: Path | str, out: Path | str | None = None, show: Show = nothin
         RecordingError: nothing can be recovered, `out` exists, or it cannot be written; nothing is left behind.
     """
     path = Path(path)
-    target = Path(out) if out is not None else path.with_name(f"{path.name.split('.')[0]}_recovered")
     bag = Bag(path)
+    target = Path(out) if out is not None else _beside(path)
     times: list[int] = []
     counts: Counter[str] = Counter()
     for connection, received, _ in bag.messages():
@@ -99,6 +99,15 @@ def recover(path: Path | str, out: Path | str | None = None, show: Show = nothin
         raise
     kept = {topic: count for topic, count in counts.items() if topic not in left_out}
     return Recovered(target, kept, seconds, tuple(bag.problems), left_out)
+
+
+def _beside(path: Path) -> Path:
+    """PATH_recovered, without the suffix of a bare file."""
+    named = path if path.name not in {"", ".."} else path.resolve()  # as in `recover .`
+    name = named.name
+    for suffix in (".zstd", *STORAGES):
+        name = name.removesuffix(suffix)
+    return named.parent / f"{name}_recovered"
 
 
 def _copy(bag: Bag, writer: BagWriter, total: int, show: Show) -> tuple[str, ...]:
