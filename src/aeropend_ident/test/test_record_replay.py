@@ -13,9 +13,10 @@ from rosbags.rosbag2 import Reader
 
 from aeropend_ident.bags.container import Bag
 from aeropend_ident.bags.recording import read
-from aeropend_ident.nodes.record import losses
+from aeropend_ident.nodes.record import _remove_bag, losses
 from aeropend_ident.nodes.replay import Plan, Replay
 from aeropend_ident.nodes.topic_recorder import TopicRecorder
+from aeropend_sim.errors import UserError
 
 FLOAT = "std_msgs/msg/Float64"
 ROSOUT = ("/rosout", "rcl_interfaces/msg/Log")
@@ -475,6 +476,8 @@ def one_line(process, program):
     [
         (["there"], "there exists: give another name, or -p overwrite:=true to replace it"),
         (["there", "--ros-args", "-p", "overwrite:=true"], "there is not a bag, or holds other files too"),
+        (["link", "--ros-args", "-p", "overwrite:=true"], "/bag: it is not overwritten, give that name or another one"),
+        (["n" * 300], "n: cannot be written: File name too long; give another name"),
         (["file"], "file exists"),
         (["file/bag"], "file/bag: cannot be written: Not a directory"),
         (["a", "b"], "one OUT only, not a b"),
@@ -486,12 +489,15 @@ def one_line(process, program):
         (["a", "--ros-args", "-p", "while_published:=1x"], "'1x' is not a topic name"),
     ],
 )
-def test_record_refuses(processes, arguments, message):
+def test_record_refuses(bags, processes, arguments, message):
     (processes.folder / "there").mkdir()
     (processes.folder / "there" / "thesis.pdf").write_text("mine")
     (processes.folder / "file").write_text("mine")
+    bags.write(processes.folder / "bag", bags.content(20))
+    (processes.folder / "link").symlink_to("bag")
     assert message in one_line(processes.start(*arguments, module="aeropend_ident.nodes.record"), "record")
-    assert sorted(file.name for file in processes.folder.iterdir()) == ["file", "there"]
+    assert sorted(file.name for file in processes.folder.iterdir()) == ["bag", "file", "link", "there"]
+    assert len(read(processes.folder / "bag")) == 20
     assert (processes.folder / "there" / "thesis.pdf").read_text() == "mine"
 
 
@@ -531,6 +537,13 @@ def test_overwrite_replaces_a_bag(bags, processes):
     start = feed(processes, 100)
     assert processes.wait(recorder)[0] == 0
     samples(read(processes.folder / "bag"), start, 100)
+
+
+def test_the_folder_in_which_it_runs_is_not_overwritten(bags, tmp_path, monkeypatch):
+    monkeypatch.chdir(bags.write(tmp_path / "bag", bags.content(20)))
+    with pytest.raises(UserError, match="go out of it first"):
+        _remove_bag(Path())
+    assert len(read(tmp_path / "bag")) == 20
 
 
 @pytest.mark.parametrize("program", ["record", "replay"])

@@ -120,12 +120,14 @@ class Record(Node):
         self._follow_gone: float | None = None
         self._recorders: dict[str, TopicRecorder] = {}
         self._refused: set[tuple[str, str]] = set()
-        if out.exists() and settings["overwrite"]:
-            _remove_bag(out)
         try:
+            if out.exists() and settings["overwrite"]:
+                _remove_bag(out)
             self._writer = BagWriter(out, settings["storage"])
         except WriterError as error:
             raise UserError(f"{out} exists: give another name, or -p overwrite:=true to replace it") from error
+        except OSError as error:
+            raise UserError(f"{out}: cannot be written: {error.strerror}; give another name") from error
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
         # No executor serves this node: the thread below reads its subscriptions.
         self._subscriber = Node(
@@ -361,6 +363,10 @@ def losses(lost: Mapping[str, int], joining: int) -> str:
 
 def _remove_bag(path: Path) -> None:
     """Remove a bag, and only a bag."""
+    if path.is_symlink():  # whoever gives the name of a link need not know which recording it stands for
+        raise UserError(f"{path} is a link to {path.resolve()}: it is not overwritten, give that name or another one")
+    if path.resolve() == Path.cwd():
+        raise UserError(f"{path} is the folder in which record runs: it is not overwritten, go out of it first")
     parts = (*STORAGES, "metadata.yaml")
     if not path.is_dir() or not all(any(part in file.name for part in parts) for file in path.iterdir()):
         raise UserError(f"{path} is not a bag, or holds other files too: it is not overwritten, give another name")
