@@ -73,6 +73,15 @@ def test_help_shows_examples_and_exit_codes(name, capsys):
     assert "2 " in codes
 
 
+@pytest.mark.parametrize("name", ["demo", "design", "excitation_quality", "isolate", "live"])
+def test_a_seed_that_cannot_be_is_one_line_before_anything_is_made(name, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="2"):
+        COMMANDS[name].load()(["--seed", "-1"])
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.promise("Commands", "Command lines in documents that begin with `.venv/bin/` name commands, options and "
                      "parameters that exist")
 @pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))

@@ -3,20 +3,22 @@ import sys
 
 import pytest
 
-from aeropend_sim.cli.command import Parser, between, called
+from aeropend_sim.cli.command import Parser, as_seed, between, called
 
 
 @pytest.fixture
 def parser():
     parser = Parser(prog="command")
     parser.add_argument("bag")
+    parser.add_argument("--seed", type=as_seed)
     parser.add_argument("--rate", type=between(0.1, 1e6, "a rate", "Hz"))
     return parser
 
 
 @pytest.mark.promise("Commands", "Commands leave out the arguments that ROS adds")
 def test_what_ros_passes_on_is_left_out(parser):
-    assert vars(parser.parse_args(["my_bag", "--ros-args", "-r", "__ns:=/rig"])) == {"bag": "my_bag", "rate": None}
+    read = vars(parser.parse_args(["my_bag", "--ros-args", "-r", "__ns:=/rig"]))
+    assert read == {"bag": "my_bag", "seed": None, "rate": None}
 
 
 @pytest.mark.parametrize("text", ["0.1", "490", "1e6"])
@@ -31,6 +33,19 @@ def test_any_other_is_refused_in_one_line(parser, capsys, text):
     assert end.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert f"'{text}' is not a rate between 0.1 and 1,000,000 Hz" in line
+
+
+@pytest.mark.parametrize(("text", "value"), [("0", 0), ("2147483647", 2**31 - 1)])
+def test_a_seed_is_a_whole_number_that_every_node_takes(parser, text, value):
+    assert parser.parse_args(["my_bag", "--seed", text]).seed == value
+
+
+@pytest.mark.parametrize("text", ["-1", "2147483648", "1.7", "x"])
+def test_what_is_no_seed_is_refused_in_one_line(parser, capsys, text):
+    with pytest.raises(SystemExit, match="2"):
+        parser.parse_args(["my_bag", f"--seed={text}"])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"'{text}' is not a seed: give a whole number, 0 to 2147483647" in line
 
 
 def test_a_command_is_called_as_a_shell_finds_it(tmp_path, monkeypatch):

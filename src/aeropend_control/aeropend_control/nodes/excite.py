@@ -22,8 +22,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from std_msgs.msg import Float64
 
 from aeropend_sim.errors import UserError
-from aeropend_sim.model.excitation import KINDS, LONGEST, Excitation
-from aeropend_sim.model.parameters import SAMPLE_PERIOD
+from aeropend_sim.model.excitation import KINDS, LONGEST, MOST_LEVELS, Excitation
+from aeropend_sim.model.parameters import LARGEST_SEED, SAMPLE_PERIOD
 from aeropend_sim.ros import interface
 from aeropend_sim.ros.diagnostics import Diagnostics
 from aeropend_sim.ros.program import run
@@ -41,7 +41,7 @@ _DEFAULT = Excitation()
 SETTINGS = {
     "kind": Setting(_DEFAULT.kind, "the signal", choices=tuple(KINDS)),
     "duration": Setting(_DEFAULT.duration, "length of the signal", "s", 0.01, LONGEST),
-    "seed": Setting(_DEFAULT.seed, "the same seed gives the same signal", low=0, high=2**31 - 1),
+    "seed": Setting(_DEFAULT.seed, "the same seed gives the same signal", low=0, high=LARGEST_SEED),
     "duty_min": Setting(_DEFAULT.duty_min, "least duty of latin_hypercube, staircase, multisine", low=-1.0, high=1.0),
     "duty_max": Setting(_DEFAULT.duty_max, "greatest duty of the same", low=-1.0, high=1.0),
     "hold_min": Setting(_DEFAULT.hold_min, "shortest hold of latin_hypercube", "s", SAMPLE_PERIOD, 600.0),
@@ -52,7 +52,7 @@ SETTINGS = {
         SAMPLE_PERIOD,
         600.0,
     ),
-    "levels": Setting(_DEFAULT.levels, "intervals of latin_hypercube, stairs of staircase", low=2, high=1000),
+    "levels": Setting(_DEFAULT.levels, "intervals of latin_hypercube, stairs of staircase", low=2, high=MOST_LEVELS),
     "rest": Setting(_DEFAULT.rest, "duty 0 after each hypercube, and after each lift of free_decay", "s", 0.0, 600.0),
     "duty": Setting(_DEFAULT.duty, "duty of hold and free_decay", low=-1.0, high=1.0),
     "sequence": Setting(list(_DEFAULT.sequence), "duties of steps and holds, repeated", low=-1.0, high=1.0),

@@ -22,7 +22,7 @@ from rich.console import Console
 from aeropend_ident.commands.programs import MODULES, ProgramError, environment, made, process, record_excited
 from aeropend_ident.diagnosis import document
 from aeropend_ident.diagnosis.document import DiagnosisDocument
-from aeropend_sim.cli.command import Parser, entry_point
+from aeropend_sim.cli.command import Parser, as_seed, entry_point
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import Model, load, save
 
@@ -80,7 +80,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--effect", choices=[*CATALOGUE, "none"], metavar="ID",
                         help="pin the hidden effect: " + ", ".join([*CATALOGUE, "none"]))
     parser.add_argument("--duration", type=float, default=60.0, metavar="S", help="seconds to record (default: 60)")
-    parser.add_argument("--seed", type=int, help="pin all chance (default: a new draw each time)")
+    parser.add_argument("--seed", type=as_seed, help="pin all chance (default: a new draw each time)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for everything (default: demo-results/<time>)")
     options = parser.parse_args(arguments)
     if not (math.isfinite(options.duration) and 10.0 <= options.duration <= 600.0):

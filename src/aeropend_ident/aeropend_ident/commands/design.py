@@ -30,7 +30,7 @@ from aeropend_ident.interrupt import interrupts_wait
 from aeropend_ident.result_folder import ensure_new, write_page
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import CHANNELS
-from aeropend_sim.cli.command import EXIT_CODES, Parser, called, entry_point, own
+from aeropend_sim.cli.command import EXIT_CODES, Parser, as_seed, called, entry_point, own
 from aeropend_sim.cli.command import between as within
 from aeropend_sim.cli.progress import progress
 from aeropend_sim.model import effect_file, excitation_file
@@ -144,7 +144,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
                         help="effect file: effects by formula that are looked at too; may be given several times")
     parser.add_argument("--tries", type=int, metavar="N",
                         help="signals that are tried (default: as many as take about a minute on two cores)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the search; default 0")
+    parser.add_argument("--seed", type=as_seed, default=0, help="seed of the search; default 0")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N",
                         help="processes (default: one a core)")
     parser.add_argument("--out", default="experiment.yaml", metavar="FILE",
@@ -159,8 +159,6 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         parser.error(f"--jobs {options.jobs}: give 1 or more")
     if options.tries is not None and options.tries < 1:
         parser.error(f"--tries {options.tries}: give 1 or more")
-    if options.seed < 0:
-        parser.error(f"--seed {options.seed}: give 0 or more")
     return options
 
 

@@ -15,7 +15,7 @@ from aeropend_ident.bags import recording
 from aeropend_ident.identification import dataset
 from aeropend_ident.identification.excitation_quality import planned, quality
 from aeropend_ident.signals.from_bag import checked
-from aeropend_sim.cli.command import EXIT_CODES, Parser, entry_point
+from aeropend_sim.cli.command import EXIT_CODES, Parser, as_seed, entry_point
 from aeropend_sim.cli.progress import progress
 from aeropend_sim.model.excitation import KINDS, Excitation
 from aeropend_sim.model.parameters import PRESETS, load
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, meaning in SIGNAL.items():
         parser.add_argument(f"--{name.replace('_', '-')}", type=float, default=getattr(plan, name), metavar="X",
                             help=f"{meaning}; default %(default)s")
-    parser.add_argument("--seed", type=int, default=plan.seed,
+    parser.add_argument("--seed", type=as_seed, default=plan.seed,
                         help="seed of the signal and of the noise; default %(default)s")
     options = parser.parse_args(arguments)
     model = load(options.model)

@@ -28,7 +28,7 @@ from aeropend_ident.interrupt import interrupts_wait
 from aeropend_ident.result_folder import ensure_new, write_page
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import CHANNELS
-from aeropend_sim.cli.command import EXIT_CODES, Parser, between, entry_point, own
+from aeropend_sim.cli.command import EXIT_CODES, Parser, as_seed, between, entry_point, own
 from aeropend_sim.cli.progress import progress
 from aeropend_sim.model import effect_file, excitation_file
 from aeropend_sim.model.effects import CATALOGUE, DEFINED
@@ -117,7 +117,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
                         help=f"length of the signal, s; default {LENGTH:g}, or that of --signal")
     parser.add_argument("--duty-max", type=between(0.0, 1.0, "a duty"), metavar="X",
                         help="greatest duty of the signal; default that of `excite`")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the signal; default 0")
+    parser.add_argument("--seed", type=as_seed, default=0, help="seed of the signal; default 0")
     parser.add_argument("--effects", action="append", default=[], metavar="FILE",
                         help="effect file: effects by formula that are looked at too; may be given several times")
     parser.add_argument("--forms", action="store_true", help="list other forms of the effects too: twice the time")

@@ -25,7 +25,7 @@ from rclpy.node import Node
 from std_msgs.msg import Float64
 
 from aeropend_ident.commands.programs import check, environment, made, process
-from aeropend_sim.cli.command import Parser, entry_point
+from aeropend_sim.cli.command import Parser, as_seed, entry_point
 from aeropend_sim.model import effect_file
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import Model, load, save
@@ -106,7 +106,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--effect", choices=SWITCHED, metavar="ID", help="pin the effect: " + ", ".join(SWITCHED))
     parser.add_argument("--since", type=float, metavar="S", help="pin the instant, seconds after the start")
     parser.add_argument("--seconds", type=float, default=math.inf, metavar="S", help="end after this time")
-    parser.add_argument("--seed", type=int, help="pin all chance (default: a new draw each time)")
+    parser.add_argument("--seed", type=as_seed, help="pin all chance (default: a new draw each time)")
     parser.add_argument("--port", type=int, default=8080, help="port of the page (default: 8080)")
     parser.add_argument("--no-browser", action="store_true", help="do not open the page")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for everything (default: live-results/<time>)")

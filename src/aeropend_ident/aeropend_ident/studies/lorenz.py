@@ -17,7 +17,7 @@ from aeropend_ident.identification.dataset import Dataset, from_arrays
 from aeropend_ident.identification.identify import METHODS, Identified, identify
 from aeropend_ident.identification.output_error import Entries, Experiment, Fitter
 from aeropend_ident.identification.terms import Array, Library, polynomials
-from aeropend_sim.cli.command import EXIT_CODES, Parser, entry_point
+from aeropend_sim.cli.command import EXIT_CODES, Parser, as_seed, entry_point
 from aeropend_sim.cli.progress import progress
 
 STATES = ("x", "y", "z")
@@ -109,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--noise", type=float, default=0.05,
                         help="noise over the standard deviation of each state (default: 0.05)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the noise and of the start (default: 0)")
+    parser.add_argument("--seed", type=as_seed, default=0, help="seed of the noise and of the start (default: 0)")
     options = parser.parse_args(arguments)
     if not (math.isfinite(options.noise) and 0.0 <= options.noise < 1.0):
         parser.error(f"--noise is {options.noise:g}: give a share from 0 to below 1")

@@ -28,7 +28,7 @@ from aeropend_ident.identification.identify import Identified, identify
 from aeropend_ident.identification.terms import Array, Library, thesis_terms
 from aeropend_ident.signals.derivatives import tv_derivative
 from aeropend_ident.tables.units import RPM
-from aeropend_sim.cli.command import Parser, entry_point
+from aeropend_sim.cli.command import Parser, as_seed, entry_point
 from aeropend_sim.model import actuator, dynamics, rig
 from aeropend_sim.model.coefficients import prepare
 from aeropend_sim.model.excitation import Excitation
@@ -327,7 +327,7 @@ exit codes: 0, 2 no such table, 130 interrupted""",
                     description="The tables of chapters 4 and 5 of the thesis, as printed and recomputed.")
     parser.add_argument("which", nargs="*", metavar="TABLE",
                         help=f"4, or a figure: {', '.join(FIGURES)} (default: all)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the excitation and of the noise (default: 0)")
+    parser.add_argument("--seed", type=as_seed, default=0, help="seed of the excitation and of the noise (default: 0)")
     options = parser.parse_args(arguments)
     wanted = options.which or ["4", *FIGURES]
     unknown = [name for name in wanted if name != "4" and name not in FIGURES]

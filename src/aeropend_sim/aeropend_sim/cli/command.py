@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn, ParamSpec
 
 from aeropend_sim.errors import UserError
-from aeropend_sim.model.parameters import PRESETS
+from aeropend_sim.model.parameters import LARGEST_SEED, PRESETS
 
 EXIT_CODES = "exit codes: 0 done, 2 the input cannot be used (one line says why), 130 interrupted"
 
@@ -113,6 +113,21 @@ def between(low: float, high: float, what: str, unit: str = "") -> Callable[[str
         return value
 
     return read
+
+
+def as_seed(text: str) -> int:
+    """The type of an argument that pins what is drawn.
+
+    Args:
+        text: the argument: a whole number, 0 to `LARGEST_SEED`.
+    """
+    try:
+        value = int(text)
+    except ValueError:
+        value = -1
+    if not 0 <= value <= LARGEST_SEED:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a seed: give a whole number, 0 to {LARGEST_SEED}")
+    return value
 
 
 P = ParamSpec("P")

@@ -9,12 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_sim.errors import UserError
-from aeropend_sim.model.parameters import SAMPLE_PERIOD
+from aeropend_sim.model.parameters import LARGEST_SEED, SAMPLE_PERIOD
 
 Array = NDArray[np.float64]
 
 LONGEST = 3600.0
 """[s] Longest signal (choice; it bounds the memory)."""
+
+MOST_LEVELS = 1000
+"""Most levels of a signal (choice: more than a duty has steps that can be told apart; it bounds the memory)."""
 
 
 @dataclass(frozen=True)
@@ -24,12 +27,12 @@ class Excitation:
     Attributes:
         kind: one of `KINDS`.
         duration: [s] length of the signal.
-        seed: the same seed gives the same signal.
+        seed: the same seed gives the same signal; 0 to `LARGEST_SEED`.
         duty_min: smallest duty of latin_hypercube, staircase and multisine, 0..1.
         duty_max: greatest duty of these, 0..1.
         hold_min: [s] shortest hold of latin_hypercube.
         hold_max: [s] longest hold of latin_hypercube, hold of steps, lift of free_decay.
-        levels: intervals of the Latin hypercube; stairs of staircase.
+        levels: intervals of the Latin hypercube; stairs of staircase; 2 to `MOST_LEVELS`.
         rest: [s] time with duty 0 after each Latin hypercube and after each lift of free_decay.
         duty: duty of hold and free_decay, 0..1.
         sequence: duties of steps and holds, repeated, 0..1.
@@ -73,7 +76,8 @@ class Excitation:
                 not SAMPLE_PERIOD <= self.hold_min <= self.hold_max,
                 f"hold_min {self.hold_min:g} s and hold_max {self.hold_max:g} s: give 0.00204 <= hold_min <= hold_max",
             ),
-            (self.levels < 2, f"levels is {self.levels}: give at least 2"),
+            (not 0 <= self.seed <= LARGEST_SEED, f"seed is {self.seed}: give 0 to {LARGEST_SEED}"),
+            (not 2 <= self.levels <= MOST_LEVELS, f"levels is {self.levels}: give 2 to {MOST_LEVELS}"),
             (self.rest < 0.0, f"rest is {self.rest:g} s: give 0 or more"),
             (not -1.0 <= self.duty <= 1.0, f"duty is {self.duty:g}: give -1 to 1"),
             (

@@ -24,6 +24,9 @@ SAMPLE_PERIOD = 64 * 510 / 16e6
 LONGEST_STEP = 2.5e-3
 """[s] Longest step. Measured: over a longer one the error exceeds 2e-5 of the range of each state of `bench`."""
 
+LARGEST_SEED = 2**31 - 1
+"""Largest seed of what is drawn (choice: every integer type of files and messages holds it)."""
+
 PRESETS = ("bench", "thesis")
 
 SECTIONS = ("model", "sensing", "definitions", "effects")

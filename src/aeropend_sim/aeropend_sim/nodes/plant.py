@@ -31,6 +31,7 @@ from aeropend_sim.errors import UserError
 from aeropend_sim.model import effect_file
 from aeropend_sim.model.effects import CATALOGUE, DEFINED, PARAMETER_MISMATCH
 from aeropend_sim.model.parameters import (
+    LARGEST_SEED,
     MODEL_NAMES,
     PARAMETERS,
     PRESETS,
@@ -58,7 +59,7 @@ BACKLOG = 49
 SETTINGS = {
     "preset": Setting("bench", "model that supplies all parameters that are not set", choices=PRESETS),
     "effect_file": Setting("", "file of effects by formula, which may then be set as effects.ID", path=True),
-    "seed": Setting(0, "seed of noise and gusts", low=0, high=2**31 - 1),
+    "seed": Setting(0, "seed of noise and gusts", low=0, high=LARGEST_SEED),
     "speed": Setting(
         1.0, "simulated over real time; not 1: publishes /clock; 0: as fast as possible", low=0.0, high=1e3
     ),
