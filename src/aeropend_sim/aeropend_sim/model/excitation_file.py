@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict, fields
 from pathlib import Path
 
@@ -81,10 +82,15 @@ def _typed(value: object, default: object, where: str) -> object:
         return value
     several = isinstance(default, tuple)
     values = value if isinstance(value, list) else [value]
-    numbers = [x for x in values if isinstance(x, (int, float)) and not isinstance(x, bool)]
+    numbers = [x for x in values
+               if isinstance(x, (int, float)) and not isinstance(x, bool) and abs(x) <= sys.float_info.max]
     if isinstance(default, str) or several != isinstance(value, list) or len(numbers) < max(len(values), 1):
         kind = "a name" if isinstance(default, str) else "a list of numbers" if several else "a number"
         raise ExcitationFileError(f"{where}: give {kind}")
     if several:
         return tuple(map(float, numbers))
-    return int(numbers[0]) if isinstance(default, int) else float(numbers[0])
+    if not isinstance(default, int):
+        return float(numbers[0])
+    if numbers[0] != int(numbers[0]):  # excite does not round either
+        raise ExcitationFileError(f"{where}: give a whole number")
+    return int(numbers[0])
