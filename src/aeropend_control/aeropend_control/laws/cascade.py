@@ -21,7 +21,15 @@ from aeropend_control.laws.gains import Gain, checked
 from aeropend_control.laws.observer import Estimate, Observer
 from aeropend_control.laws.pid import PID
 from aeropend_control.laws.reference_model import DAMPING, ReferenceModel
-from aeropend_control.laws.tuning import OPERATING_POINT, TABLE_6_1, TIME_SHARE, Requirements, place, thrust_lag
+from aeropend_control.laws.tuning import (
+    OPERATING_POINT,
+    TABLE_6_1,
+    TIME_SHARE,
+    Requirements,
+    check,
+    place,
+    thrust_lag,
+)
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, Model
 from aeropend_sim.model.rig import Sample
 from aeropend_sim.model.state import State
@@ -154,8 +162,12 @@ class Cascade:
 
         Args:
             model: the model of the rig.
-            requirements: on the step response.
+            requirements: on the step response; t_p and M_p have no influence.
+
+        Raises:
+            TuningError: a requirement makes no sense; one line that names it.
         """
+        check(requirements)
         follow = TIME_SHARE * min(requirements.t_r / 2.2, requirements.t_s / 4.0)
         return {**_defaults(), **tune(model, follow)}
 
@@ -214,11 +226,12 @@ class FeedbackLinearizationCascade(FeedbackLinearization):
 
         Args:
             model: the model of the rig.
-            requirements: on the step response.
+            requirements: on the step response; M_p has no influence.
 
         Raises:
             TuningError: a requirement cannot be met; one line that names it.
         """
+        check(requirements)
         air = model.effect("thrust_lag", "tau")
         slower = min(requirements.t_r / 0.5, requirements.t_p / 0.9, requirements.t_s / 1.2)
         decay = LOOP_FREQUENCY / slower * DAMPING

@@ -31,6 +31,7 @@ class LawKind:
         parameters: the gains by name.
         presets: complete sets of gains by name; `thesis`: those of the thesis.
         requirements: default of the requirements for tuning.
+        uses: names of the requirements on which the tuned gains depend.
     """
 
     summary: str
@@ -42,6 +43,7 @@ class LawKind:
     _tune: Callable[[Model, Requirements], dict[str, float]]
     presets: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     requirements: Requirements = TABLE_6_1
+    uses: tuple[str, ...] = Requirements._fields
 
     def make(self, model: Model, gains: Mapping[str, float] | None = None, **options: Any) -> Law:
         """Make a law for a model.
@@ -83,11 +85,11 @@ LAWS: dict[str, LawKind] = {
                                       {"thesis": {**feedback_linearization.THESIS_GAINS, "thrust_time": 0.0}}),
     "cascade": LawKind("speed PI and current PI in cascade, for the rotor's speed", "omega", "rad/s", (0.0, 200.0),
                        Cascade.parameters, Cascade, Cascade.tune, {"thesis": cascade.THESIS_GAINS},
-                       cascade.REQUIREMENTS),
+                       cascade.REQUIREMENTS, ("t_r", "t_s")),
     "feedback_linearization_cascade": LawKind(
         "PID with feedback linearization, its thrust controlled by the cascade", *ANGLE,
         FeedbackLinearizationCascade.parameters, FeedbackLinearizationCascade, FeedbackLinearizationCascade.tune,
         {"thesis": {**feedback_linearization.THESIS_GAINS, **cascade.THESIS_GAINS, "reference_time": 0.0,
-                    "thrust_time": 0.0}}),
+                    "thrust_time": 0.0}}, uses=("t_r", "t_p", "t_s")),
 }
 """All laws by name, which is also the name of the node."""

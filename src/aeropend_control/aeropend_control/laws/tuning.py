@@ -40,6 +40,20 @@ TABLE_6_1 = Requirements()
 """The thesis' requirements, Table 6.1."""
 
 
+def check(r: Requirements) -> None:
+    """Make sure that all limits of a step response can be met by some.
+
+    Args:
+        r: the limits.
+
+    Raises:
+        TuningError: one is not above 0, or no number; one line that names it.
+    """
+    for name, value in r._asdict().items():
+        if not 0.0 < value < math.inf:
+            raise TuningError(f"{name} is {value:g}; give a number above 0")
+
+
 class Pair(NamedTuple):
     """A dominant pair of poles: s² + 2 decay s + omega_2; [1/s], [1/s²]."""
 
@@ -90,9 +104,7 @@ def settling_time(r: Requirements, M_p: float) -> float:
     Raises:
         TuningError: a time is not positive, or the overshoot is out of range.
     """
-    for name, value in r._asdict().items():
-        if not 0.0 < value < math.inf:
-            raise TuningError(f"{name} is {value:g}; give more than 0")
+    check(r)
     if not 0.0 < M_p < 1.0:
         raise TuningError(f"overshoot {M_p:g}: give a share above 0 and below 1")
     zeta = _damping(M_p)
