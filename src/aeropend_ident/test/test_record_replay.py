@@ -514,6 +514,7 @@ def test_record_refuses(bags, processes, arguments, message):
         (["empty"], "empty: holds no messages to replay"),
         (["rigs", "--ros-args", "-r", "__ns:=/x"], "several recorded topics would become /x/"),
         (["strange", "--ros-args", "-p", "topics:=strange"], "/strange cannot be replayed: message type no_msgs"),
+        (["single", "--ros-args", "-p", "loop:=true"], "single: what would be replayed was received at one instant"),
         (["late", "--ros-args", "-p", "clock:=10.0"], "late: was received beyond 2038, which /clock"),
     ],
 )
@@ -527,6 +528,7 @@ def test_replay_refuses(bags, processes, arguments, message):
 
     bags.store.register(get_types_from_msg("float64 x", "no_msgs/msg/No"))
     bags.write(processes.folder / "strange", bags.Content([("/strange", "no_msgs/msg/No", 5, bags.number(1.0))]))
+    bags.write(processes.folder / "single", commands(bags, [0.1]))
     bags.write(processes.folder / "late", bags.Content([("/reference", FLOAT, 2**62, bags.number(1.0))]))
     assert message in one_line(processes.start(*arguments, module="aeropend_ident.nodes.replay"), "replay")
 

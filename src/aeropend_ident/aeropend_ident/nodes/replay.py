@@ -223,6 +223,9 @@ class Replay(Node):
         self._stop_duty: bool = settings["stop_duty"]
         topics = [topic.strip() for topic in settings["topics"].split(",") if topic.strip()]
         self._plan = Plan(path, topics, settings["namespace"], settings["start"])
+        if self._loop and self._plan.start == self._plan.end:
+            raise UserError(f"{path}: what would be replayed was received at one instant, and a loop of it would not "
+                            "wait: leave loop out, or begin earlier")
         if settings["clock"] and self._plan.end >= interface.LATEST_NS:
             raise UserError(f"{path}: was received beyond 2038, which {CLOCK} cannot tell: leave clock out")
         for problem in self._plan.bag.problems:
