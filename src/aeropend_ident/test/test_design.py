@@ -194,7 +194,7 @@ def test_the_command_prints_json(tmp_path, capsys):
 @pytest.mark.parametrize(("arguments", "said"), [
     (["--separate", "nonsense"], "'nonsense' is no effect"), (["--tries", "0"], "give 1 or more"),
     (["--theta", "0.2", "1"], "angle 0.2 to 1"), (["--duration", "3"], "a time between 5"),
-    (["--verdict", "nowhere"], "nowhere")])
+    (["--verdict", "nowhere"], "nowhere"), (["--namespace", "/rig1"], "name a BAG")])
 def test_what_cannot_be_designed_is_said_in_one_line(tmp_path, capsys, arguments, said):
     try:
         code = main([*arguments, "--out", str(tmp_path / "x.yaml")])

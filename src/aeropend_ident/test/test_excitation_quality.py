@@ -36,6 +36,17 @@ def test_an_input_that_does_nothing_is_refused(capsys):
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
 
+@pytest.mark.parametrize(("arguments", "said"), [
+    (["my_bag", "--kind", "hold", "--duration", "20", "--seed", "1"], "leave --kind, --duration and --seed out"),
+    (["my_bag", "--rest", "0"], "a bag has its own duty: leave --rest out"),
+    (["--namespace", "/rig1"], "--namespace tells the rigs of a recording apart")])
+def test_an_option_without_influence_is_refused_in_one_line(arguments, said, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(arguments)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+
+
 def test_a_bag_tells_what_it_excites(bags, tmp_path, capsys):
     said = []
     for name, duty in {"rich": Excitation(duration=8.0, hold_max=1.0).series(),

@@ -176,6 +176,22 @@ def test_an_experiment_that_cannot_be_planned_is_one_line(arguments, said, capsy
     assert said in line
 
 
+@pytest.mark.parametrize(("arguments", "said"), [
+    (["my_bag", "--duration", "60", "--seed", "1"], "a bag has its own duty: leave --duration and --seed out"),
+    (["my_bag", "--kind", "hold", "--duty-max", "0.3"], "a bag has its own duty: leave --kind and --duty-max out"),
+    (["my_bag", "--experiment", "7"], "a bag has its own duty: leave --experiment out"),
+    (["my_bag", "--signal", "x.yaml"], "a bag has its own duty: leave --signal out"),
+    (["--signal", "x.yaml", "--seed", "0"], "--signal is a signal: leave --seed out"),
+    (["--experiment", "7", "--kind", "hold"], "--experiment is a signal: leave --kind out"),
+    (["--experiment", "7", "--signal", "x.yaml"], "are two signals"),
+    (["--namespace", "/rig1"], "--namespace tells the rigs of a recording apart")])
+def test_an_option_without_influence_is_refused_in_one_line(arguments, said, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(arguments)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+
+
 def test_an_unknown_channel_is_refused():
     with pytest.raises(PlanError, match="no channel"):
         planned(BENCH, DUTY, ("theta", "theta_dot"))

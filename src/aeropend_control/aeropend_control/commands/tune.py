@@ -16,7 +16,7 @@ from aeropend_control.analysis import closed_loop
 from aeropend_control.analysis.margins import MarginError, Margins, margins
 from aeropend_control.analysis.step_response import StepError, StepResponse, step_responses
 from aeropend_control.laws.registry import LAWS, GainError, LawKind, Requirements, TuningError
-from aeropend_sim.cli.command import EXIT_CODES, Parser, entry_point
+from aeropend_sim.cli.command import EXIT_CODES, Parser, entry_point, given
 from aeropend_sim.cli.progress import Show, nothing, progress
 from aeropend_sim.model.parameters import Model, load
 from aeropend_sim.wording import enumerated
@@ -65,17 +65,16 @@ def chosen_gains(kind: LawKind, model: Model, options: argparse.Namespace) -> di
         GainError: there is no such preset, or a preset and a requirement are given.
         TuningError: a requirement cannot be met, or has no influence.
     """
-    given = {name: getattr(options, name) for name in Requirements._fields if getattr(options, name) is not None}
-    words = {name: "--" + name.lower().replace("_", "-") for name in given}
     if options.gains is not None:
         if options.gains not in kind.presets:
             raise GainError(f"no gains '{options.gains}'; give one of {', '.join(kind.presets)}")
-        if given:
-            raise GainError(f"--gains {options.gains} is shown as it is: leave {enumerated([*words.values()])} out")
+        if words := given(options, Requirements._fields):
+            raise GainError(f"--gains {options.gains} is shown as it is: leave {enumerated(words)} out")
         return dict(kind.presets[options.gains])
-    if idle := [words[name] for name in given if name not in kind.uses]:
+    if idle := given(options, [name for name in Requirements._fields if name not in kind.uses]):
         raise TuningError(f"{options.law} is tuned by {enumerated([*kind.uses])} alone: leave {enumerated(idle)} out")
-    return kind.tune(model, kind.requirements._replace(**given))
+    wanted = {name: getattr(options, name) for name in kind.uses if getattr(options, name) is not None}
+    return kind.tune(model, kind.requirements._replace(**wanted))
 
 
 def gains_table(kind: LawKind, gains: Mapping[str, float]) -> Table:

@@ -155,6 +155,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     options = parser.parse_args(arguments)
     if options.bag and options.channels:
         parser.error("a bag has its own channels: leave --channels out")
+    if options.namespace and not options.bag:
+        parser.error("--namespace tells the rigs of a recording apart: name a BAG, or leave it out")
     if options.jobs < 1:
         parser.error(f"--jobs {options.jobs}: give 1 or more")
     if options.tries is not None and options.tries < 1:

@@ -15,11 +15,12 @@ from aeropend_ident.bags import recording
 from aeropend_ident.identification import dataset
 from aeropend_ident.identification.excitation_quality import planned, quality
 from aeropend_ident.signals.from_bag import checked
-from aeropend_sim.cli.command import EXIT_CODES, Parser, as_seed, entry_point
+from aeropend_sim.cli.command import EXIT_CODES, Parser, as_seed, entry_point, given
 from aeropend_sim.cli.progress import progress
 from aeropend_sim.model.excitation import KINDS, Excitation
 from aeropend_sim.model.parameters import PRESETS, load
 from aeropend_sim.untrusted import printable
+from aeropend_sim.wording import enumerated
 
 EXAMPLES = f"""examples:
   excitation_quality --duration 20 --duty-max 0.3        a signal of `excite`, before it is recorded
@@ -43,23 +44,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
                         help=f"{' or '.join(PRESETS)}, or a model file (default: bench)")
     parser.add_argument("--namespace", metavar="NS", help="namespace of the rig, if the bag has several")
     plan = Excitation()
-    parser.add_argument("--kind", choices=KINDS, default=plan.kind,
-                        help="kind of the signal, as in `excite`; default %(default)s")
+    parser.add_argument("--kind", choices=KINDS, help=f"kind of the signal, as in `excite`; default {plan.kind}")
     for name, meaning in SIGNAL.items():
-        parser.add_argument(f"--{name.replace('_', '-')}", type=float, default=getattr(plan, name), metavar="X",
-                            help=f"{meaning}; default %(default)s")
-    parser.add_argument("--seed", type=as_seed, default=plan.seed,
-                        help="seed of the signal and of the noise; default %(default)s")
+        parser.add_argument(f"--{name.replace('_', '-')}", type=float, metavar="X",
+                            help=f"{meaning}; default {getattr(plan, name)}")
+    parser.add_argument("--seed", type=as_seed, help=f"seed of the signal and of the noise; default {plan.seed}")
     options = parser.parse_args(arguments)
+    names = ("kind", *SIGNAL, "seed")
+    if options.bag and (words := given(options, names)):
+        parser.error(f"a bag has its own duty: leave {enumerated(words)} out")
+    if options.namespace and not options.bag:
+        parser.error("--namespace tells the rigs of a recording apart: name a BAG, or leave it out")
     model = load(options.model)
     with progress("reading") as show:
         if options.bag:
             read = checked(recording.read(options.bag, options.namespace), model)
             data = dataset.from_bag(read, model.sensing, held_out=0.0)
         else:
-            signal = Excitation(options.kind, options.duration, options.seed, options.duty_min, options.duty_max,
-                                options.hold_min, options.hold_max, rest=options.rest)
-            data = planned(model, signal.series())
+            signal = Excitation(**{k: v for k in names if (v := getattr(options, k)) is not None})
+            data = planned(model, signal.series(), seed=signal.seed)
         found = quality(model, data, show)
     for note in data.notes:
         print(printable(f"note: {note}"))

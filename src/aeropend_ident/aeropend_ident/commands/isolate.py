@@ -28,13 +28,14 @@ from aeropend_ident.interrupt import interrupts_wait
 from aeropend_ident.result_folder import ensure_new, write_page
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import CHANNELS
-from aeropend_sim.cli.command import EXIT_CODES, Parser, as_seed, between, entry_point, own
+from aeropend_sim.cli.command import EXIT_CODES, Parser, as_seed, between, entry_point, given, own
 from aeropend_sim.cli.progress import progress
 from aeropend_sim.model import effect_file, excitation_file
 from aeropend_sim.model.effects import CATALOGUE, DEFINED
 from aeropend_sim.model.excitation import KINDS, LONGEST, Excitation
 from aeropend_sim.model.parameters import PRESETS, load
 from aeropend_sim.untrusted import printable
+from aeropend_sim.wording import enumerated
 
 EXAMPLES = f"""examples:
   isolate                                             half a minute of random steps, all channels
@@ -117,7 +118,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
                         help=f"length of the signal, s; default {LENGTH:g}, or that of --signal")
     parser.add_argument("--duty-max", type=between(0.0, 1.0, "a duty"), metavar="X",
                         help="greatest duty of the signal; default that of `excite`")
-    parser.add_argument("--seed", type=as_seed, default=0, help="seed of the signal; default 0")
+    parser.add_argument("--seed", type=as_seed, help="seed of the signal; default 0")
     parser.add_argument("--effects", action="append", default=[], metavar="FILE",
                         help="effect file: effects by formula that are looked at too; may be given several times")
     parser.add_argument("--forms", action="store_true", help="list other forms of the effects too: twice the time")
@@ -131,13 +132,15 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--html", metavar="FILE", help="write a page with the matrix of pairs")
     parser.add_argument("--overwrite", action="store_true", help="replace the file of --html")
     options = parser.parse_args(arguments)
-    if options.bag and (options.kind or options.experiment or options.signal or options.duty_max is not None):
-        parser.error("a bag has its own duty: leave --kind, --experiment, --signal and --duty-max out")
-    for name in ("experiment", "signal"):
-        if getattr(options, name) and (options.kind or options.duty_max is not None):
-            parser.error(f"--{name} has its own signal: leave --kind and --duty-max out")
     if options.experiment and options.signal:
         parser.error("--experiment and --signal are two signals: give one")
+    for source, told, idle in (("bag", "a bag has its own duty", ("experiment", "signal", "duration", "seed")),
+                               ("experiment", "--experiment is a signal", ()),
+                               ("signal", "--signal is a signal", ("seed",))):
+        if getattr(options, source) and (words := given(options, ("kind", "duty_max", *idle))):
+            parser.error(f"{told}: leave {enumerated(words)} out")
+    if options.namespace and not options.bag:
+        parser.error("--namespace tells the rigs of a recording apart: name a BAG, or leave it out")
     if options.jobs < 1:
         parser.error(f"--jobs {options.jobs}: give 1 or more")
     return options
@@ -149,8 +152,8 @@ def _signal(options: argparse.Namespace) -> Excitation:
         return signal if options.duration is None else replace(signal, duration=options.duration)
     seconds = LENGTH if options.duration is None else options.duration
     if options.experiment:
-        return replace(EXPERIMENTS[options.experiment - 1], duration=seconds, seed=options.seed)
-    signal = Excitation(options.kind or "latin_hypercube", seconds, options.seed)
+        return replace(EXPERIMENTS[options.experiment - 1], duration=seconds, seed=options.seed or 0)
+    signal = Excitation(options.kind or "latin_hypercube", seconds, options.seed or 0)
     top = options.duty_max
     if top is None:
         return signal

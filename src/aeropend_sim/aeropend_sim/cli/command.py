@@ -115,6 +115,16 @@ def between(low: float, high: float, what: str, unit: str = "") -> Callable[[str
     return read
 
 
+def given(options: argparse.Namespace, names: Iterable[str]) -> list[str]:
+    """The options of a command line that were given, as a person writes them: `--duty-max`.
+
+    Args:
+        options: what the parser returned; None is the default of each option.
+        names: of the options, as attributes: `duty_max`.
+    """
+    return [f"--{name.lower().replace('_', '-')}" for name in names if getattr(options, name) is not None]
+
+
 def as_seed(text: str) -> int:
     """The type of an argument that pins what is drawn.
 
