@@ -91,11 +91,16 @@ def test_results_are_not_overwritten_unasked(bag, tmp_path):
     (["BAG", "--colour"], "--colour"),
     (["BAG", "--test", "no_such_bag"], "no_such_bag"),
     (["BAG", "--test", "BAG"], "fitted to"),
+    (["BAG", "--test", "BAG/my_bag.mcap"], "fitted to"),
+    (["BAG", "other", "BAG/"], "my_bag/ is given twice"),
+    (["BAG/my_bag.mcap", "BAG"], "my_bag is given twice"),
+    (["BAG", "--test", "t", "--test", "./t"], "--test ./t is given twice"),
+    (["BAG", "--since", "monday", "--since", "monday/"], "--since monday/ is given twice"),
     (["--each", "BAG", "--test", "no_such_bag"], "--each"),
     (["--each", "BAG", "--open"], "--open"),
 ])
 def test_a_wrong_command_line_is_one_line(bag, tmp_path, arguments, words):
-    message = refused(*[bag if a == "BAG" else a for a in arguments], "--out", tmp_path / "out")
+    message = refused(*[a.replace("BAG", str(bag)) for a in arguments], "--out", tmp_path / "out")
     assert words in message
     assert not (tmp_path / "out").exists()
 

@@ -142,11 +142,21 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         parser.error("--test needs recordings of one rig: leave --each out")
     if options.junit and not options.fail_on:
         parser.error("--junit writes what rules say: give at least one --fail-on")
+    for option, paths in (("", [] if options.each else options.bags), ("--test ", options.test),
+                          ("--since ", options.since)):
+        if twice := [path for k, path in enumerate(paths) if any(_same(path, other) for other in paths[:k])]:
+            parser.error(f"{option}{twice[0]} is given twice, and would count twice: give it once")
     for bag in options.test:
-        if Path(bag).resolve() in {Path(fitted).resolve() for fitted in options.bags}:
+        if any(_same(bag, fitted) for fitted in options.bags):
             parser.error(f"--test {bag}: nothing may be fitted to a test recording; give it once")
     options.jobs = options.jobs or os.cpu_count() or 1
     return options
+
+
+def _same(one: str, other: str) -> bool:
+    """Whether two paths are of one recording or verdict: the same place, or a bag's folder and a file of it."""
+    both = {Path(os.path.realpath(one)), Path(os.path.realpath(other))}
+    return len(both) == 1 or any(path.is_file() and path.parent in both for path in both)
 
 
 def _jobs(text: str) -> int:
