@@ -42,6 +42,20 @@ def test_a_running_rig_is_investigated_until_the_verdict_is_sure(tmp_path):
     assert (out / "1" / "experiment.html").is_file()
 
 
+def test_what_was_found_before_an_experiment_failed_is_kept(tmp_path):
+    rig, out = ["-r", "__ns:=/gone"], tmp_path / "out"
+    with Process("plant", *parameters(effects__cable_torque__k=0.25, effects__cable_torque__theta0=0.4), *rig) as plant:
+        plant.wait_for("model bench")
+        with Inquiry("investigate", *SMALL, "--most", "40", "--out", str(out), "--ros-args", *rig) as inquiry:
+            inquiry.wait_for("verdict: ")
+            assert plant.stop() == 0
+            assert inquiry.wait(180.0) == 2, inquiry.output
+            *_, last = inquiry.output.strip().splitlines()
+    assert f"investigate: {out / '2' / 'recording'}: " in last
+    assert last.endswith(f"; {out / 'verdict'} has the verdict so far")
+    assert json.loads((out / "verdict" / "diagnosis.json").read_text())["bags"] == [str(out / "1" / "recording")]
+
+
 def test_a_rig_that_somebody_drives_is_left_alone(tmp_path):
     rig = ["-r", "__ns:=/driven"]
     with (

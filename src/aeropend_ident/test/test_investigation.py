@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Experiments one after another, on simulated rigs: when they end, and with what verdict."""
 
+from pathlib import Path
+
 import pytest
 
-from aeropend_ident.commands.investigate import main
+from aeropend_ident.commands.investigate import _left, main, parse
 from aeropend_ident.design.design import LENGTH
 from aeropend_ident.design.investigation import Investigation
 from aeropend_ident.design.limits import Limits
 from aeropend_ident.diagnosis.isolation.planned import planned
 from aeropend_ident.diagnosis.results import document
 from aeropend_ident.signals.signals import from_arrays
+from aeropend_sim.cli.command import called
 from aeropend_sim.model import rig
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import SAMPLE_PERIOD, load
@@ -62,6 +65,15 @@ def test_it_ends_when_the_time_is_over(first):
     assert len(verdicts) == 1
     assert not inquiry.sure
     assert "apart" in inquiry.ended or "not sure after 20 s" in inquiry.ended
+
+
+@pytest.mark.parametrize(("recorded", "judged", "said"), [
+    (0, 0, ""), (1, 1, "; out/verdict has the verdict so far"),
+    (2, 0, "; diagnose what is recorded: COMMAND out/1/b out/2/b --model rig.yaml")])
+def test_the_line_of_an_inquiry_that_is_broken_off_says_what_is_left(recorded, judged, said):
+    bags = [f"out/{k}/b" for k in range(1, recorded + 1)]
+    line = _left(Path("out"), bags, judged, parse(["--model", "rig.yaml"]))
+    assert line == said.replace("COMMAND", called("diagnose", "aeropend_ident"))
 
 
 def test_without_a_terminal_nobody_can_agree(capsys, monkeypatch):

@@ -35,8 +35,9 @@ from aeropend_ident.interrupt import interrupts_wait
 from aeropend_ident.result_folder import write_page
 from aeropend_ident.signals.from_bag import signals_of
 from aeropend_ident.signals.signals import CHANNELS
-from aeropend_sim.cli.command import Parser, between, entry_point, own
+from aeropend_sim.cli.command import Parser, between, called, entry_point, own
 from aeropend_sim.cli.progress import Show, progress
+from aeropend_sim.errors import UserError
 from aeropend_sim.model import effect_file, excitation_file
 from aeropend_sim.model.excitation import Excitation
 from aeropend_sim.model.parameters import PRESETS, load
@@ -52,6 +53,9 @@ PATIENCE = 10.0
 SETTLED = 3.0
 """[s] Time in which all publishers are known, after a subscriber is (choice: discovery takes about a second)."""
 
+OFF = "interrupted; the motor is off"
+"""The line after Ctrl-C."""
+
 LOOK = 0.1
 """[s] Time between two looks at the graph (choice)."""
 
@@ -66,7 +70,7 @@ A plant or a bridge must run, and no controller. Ctrl-C stops the motor.
 exit codes: 0 the verdict is sure, 1 it is not (the last line says why), 2 it could not run, 130 interrupted"""
 
 
-@entry_point("investigate", "interrupted; the motor is off")
+@entry_point("investigate", OFF)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
@@ -84,38 +88,54 @@ def main(arguments: Sequence[str] | None = None) -> int:
     inquiry = Investigation(model, signals, limits, options.most, further=further, jobs=options.jobs,
                             tries=options.tries)
     bags: list[str] = []
+    judged = 0
     started = time.monotonic()
-    results: Results | None = None
 
     def diagnosed(found: Diagnosis) -> DiagnosisDocument:
         return document(found, bags, options.model, time.monotonic() - started)
 
-    while True:
-        with progress("designing") as show, interrupts_wait():
-            proposal = inquiry.next(partial(_shown, show))
-        if proposal is None:
-            break
-        place = folder / str(len(bags) + 1)
-        place.mkdir()
-        announce(proposal, place, command)
-        if not options.yes and not agreed():
-            inquiry.ended = "The experiment was refused."
-            break
-        bag = place / "recording"
-        record_excited(bag, ["--params-file", str(place / "experiment.yaml")], proposal.designed.excitation.duration,
-                       environment={**os.environ, "PYTHONUNBUFFERED": "1"}, console=console, namespace=ros[1:])
-        bags.append(str(bag))
-        with progress("reading") as show:
-            read = signals_of(bag, None, model)
-            with interrupts_wait():
-                found = inquiry.add(read, diagnosed, partial(_shown, show))
-        results = Results.of(found, diagnosed(found), command)
-        print("\n".join(map(printable, verdict_lines(results.document, advice=False))), flush=True)
-    if results is not None:
-        results.write(folder / "verdict", overwrite=False)
+    try:
+        while True:
+            with progress("designing") as show, interrupts_wait():
+                proposal = inquiry.next(partial(_shown, show))
+            if proposal is None:
+                break
+            place = folder / str(len(bags) + 1)
+            place.mkdir()
+            announce(proposal, place, command)
+            if not options.yes and not agreed():
+                inquiry.ended = "The experiment was refused."
+                break
+            bag = place / "recording"
+            record_excited(bag, ["--params-file", str(place / "experiment.yaml")],
+                           proposal.designed.excitation.duration, environment={**os.environ, "PYTHONUNBUFFERED": "1"},
+                           console=console, namespace=ros[1:])
+            with progress("reading") as show:
+                read = signals_of(bag, None, model)
+                bags.append(str(bag))
+                with interrupts_wait():
+                    found = inquiry.add(read, diagnosed, partial(_shown, show))
+            results = Results.of(found, diagnosed(found), command)
+            results.write(folder / "verdict", overwrite=True)  # the next experiment may fail
+            judged = len(bags)
+            print("\n".join(map(printable, verdict_lines(results.document, advice=False))), flush=True)
+    except UserError as error:
+        raise ProgramError(f"{error}{_left(folder, bags, judged, options)}") from error
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(printable(f"{OFF}{_left(folder, bags, judged, options)}")) from None
+    if judged:
         print(printable(f"{folder / 'verdict' / 'report.html'}   {folder / 'verdict' / 'augmented.yaml'}"))
     print(printable(f"{len(bags)} experiments, {inquiry.moved:.0f} s of motion. {inquiry.ended}"))
     return 0 if inquiry.sure else NOT_SURE
+
+
+def _left(folder: Path, bags: Sequence[str], judged: int, options: argparse.Namespace) -> str:
+    """What an inquiry that is broken off leaves, for the end of its line."""
+    done = f"; {folder / 'verdict'} has the verdict so far" if judged else ""
+    if len(bags) > judged:
+        words = [*bags, "--model", options.model, *(word for file in options.effects for word in ("--effects", file))]
+        done += f"; diagnose what is recorded: {called('diagnose', 'aeropend_ident')} {shlex.join(words)}"
+    return done
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
