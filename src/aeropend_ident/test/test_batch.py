@@ -284,6 +284,20 @@ def test_an_interrupt_between_two_recordings_ends_the_work_at_once(here, recordi
     assert begun[0].gi_frame is None
 
 
+@pytest.mark.parametrize(("at", "line"), [("diagnose_each", "interrupted, nothing was written"),
+                                         ("row", "interrupted; 1 of 2 verdicts are in OUT")])
+def test_an_interrupt_counts_no_verdict_that_was_there_before(here, recordings, tmp_path, monkeypatch, at, line):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    for name in ("run", "run_2"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "diagnosis.json").write_text("old")
+    monkeypatch.setattr(batch, at, interrupt)
+    code, _, complained = here("--each", *recordings[:1] * 2, "--out", tmp_path, "--jobs", 1, "--overwrite")
+    assert (code, complained) == (130, f"diagnose: {line.replace('OUT', str(tmp_path))}\n")
+
+
 @pytest.mark.parametrize(("bags", "names"), [
     (["a", "b/c", "d.mcap", "e.1"], ["a", "c", "d", "e.1"]),
     (["x/run", "y/run", "z"], ["x_run", "y_run", "z"]),

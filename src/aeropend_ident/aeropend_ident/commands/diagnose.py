@@ -257,6 +257,8 @@ def run_each(options: argparse.Namespace, rules: Sequence[checks.Rule]) -> list[
     settings = batch.Settings(model, options.model, options.namespace, options.held_out, options.fit_nominal,
                               options.material, options.seconds, further,
                               effect_file.definitions([*further, *model.effects]))
+    files = [out / name / "diagnosis.json" for name in names]
+    before = [_version(file) for file in files]
     commands = [_alone(options, bag, out / name) for bag, name in zip(options.bags, names)]
     rows, said = [], []
     try:
@@ -272,7 +274,7 @@ def run_each(options: argparse.Namespace, rules: Sequence[checks.Rule]) -> list[
                 rows.append(batch.row(outcome, name))
                 show(len(rows), f"{len(rows)} of {len(names)} recordings")
     except KeyboardInterrupt:
-        done = sum((out / name / "diagnosis.json").exists() for name in names)
+        done = sum(_version(file) not in (None, was) for file, was in zip(files, before))
         if not done:
             raise
         raise KeyboardInterrupt(printable(f"interrupted; {done} of {len(names)} verdicts are in {out}")) from None
@@ -286,6 +288,15 @@ def run_each(options: argparse.Namespace, rules: Sequence[checks.Rule]) -> list[
     print(printable(f"{len(rows) - refused} of {len(rows)} diagnosed   {out / batch.SUMMARY}   "
                     f"{time.monotonic() - started:.1f} s"))
     return said
+
+
+def _version(file: Path) -> tuple[int, int] | None:
+    """What tells a file from one that took its place; None if there is none."""
+    try:
+        found = file.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_mtime_ns
 
 
 def _alone(options: argparse.Namespace, bag: str, out: Path) -> str:
