@@ -107,7 +107,8 @@ def zeros(base: Calibration, pwm: Sequence[Sample], ssi: Sequence[Sample]) -> tu
         bad = sum(bool(sample.flags & (Flag.SSI_PARITY | Flag.SSI_STATUS)) for sample in samples)
         good = [sample.angle for sample in samples if not sample.flags & (Flag.SSI_PARITY | Flag.SSI_STATUS)]
         if bad > BAD_ANGLES * len(samples) or not good:
-            notes.append(f"{name}_zero is not measured: {bad} of {len(samples)} angles came with errors")
+            why = f"{bad} of {len(samples)} angles came with errors" if samples else f"scheme {name} gave no sample"
+            notes.append(f"{name}_zero is not measured: {why}")
             continue
         found[f"{name}_zero"], spread = mean_on_circle(good)
         if spread > STILL:
