@@ -78,7 +78,7 @@ def changes(series: np.ndarray, repeat: int = REPEAT) -> np.ndarray:
     """Samples at which a signal must be published: where it changes, and every `repeat` samples in between.
 
     Args:
-        series: [0..1] (N,) duty.
+        series: [-1..1] (N,) duty.
         repeat: [samples] longest distance.
 
     Returns:

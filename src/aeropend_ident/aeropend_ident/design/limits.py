@@ -33,7 +33,7 @@ class Limits:
         theta: [rad] least and greatest angle of the arm.
         omega: [rad/s] greatest speed of the rotor.
         i_a: [A] greatest current, in either direction.
-        duty: [0..1] least and greatest duty.
+        duty: [-1..1] least and greatest duty.
         duty_rate: [1/s] greatest rate of the duty; 0: it may jump.
 
     Raises:

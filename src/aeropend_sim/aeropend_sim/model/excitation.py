@@ -22,20 +22,20 @@ MOST_LEVELS = 1000
 
 @dataclass(frozen=True)
 class Excitation:
-    """One duty signal. Each kind uses only the fields that it names.
+    """One duty signal. Each kind uses only the fields that it names. Below 0 a bridge reverses or brakes the motor.
 
     Attributes:
         kind: one of `KINDS`.
         duration: [s] length of the signal.
         seed: the same seed gives the same signal; 0 to `LARGEST_SEED`.
-        duty_min: smallest duty of latin_hypercube, staircase and multisine, 0..1.
-        duty_max: greatest duty of these, 0..1.
+        duty_min: smallest duty of latin_hypercube, staircase and multisine, -1..1.
+        duty_max: greatest duty of these, -1..1.
         hold_min: [s] shortest hold of latin_hypercube.
         hold_max: [s] longest hold of latin_hypercube, hold of steps, lift of free_decay.
         levels: intervals of the Latin hypercube; stairs of staircase; 2 to `MOST_LEVELS`.
         rest: [s] time with duty 0 after each Latin hypercube and after each lift of free_decay.
-        duty: duty of hold and free_decay, 0..1.
-        sequence: duties of steps and holds, repeated, 0..1.
+        duty: duty of hold and free_decay, -1..1.
+        sequence: duties of steps and holds, repeated, -1..1.
         holds: [s] time of each duty of holds.
         frequencies: [Hz] frequencies of multisine.
         duty_rate: [1/s] greatest rate of the duty, of every kind; 0 = it may jump.
@@ -102,7 +102,7 @@ class Excitation:
                 raise UserError(message)
 
     def series(self) -> Array:
-        """The duty (N,) at each sample, 0..1, held for one `SAMPLE_PERIOD`."""
+        """The duty (N,) at each sample, -1..1, held for one `SAMPLE_PERIOD`."""
         series = KINDS[self.kind](self)
         return _limited(series, self.duty_rate * SAMPLE_PERIOD) if self.duty_rate > 0.0 else series
 

@@ -307,7 +307,7 @@ def load(source: str | Path) -> Model:
 def read_flat(source: str | Path) -> dict[str, object]:
     """Read the values of a preset or a model file, unchecked, by their dotted names.
 
-    Keys outside `model`, `sensing` and `effects` are parameters of a node and are left out.
+    Keys outside of the `SECTIONS` are parameters of a node and are left out.
 
     Args:
         source: name of a preset, or path.

@@ -2,7 +2,8 @@
 """Topics, message types and quality of service of an aeropendulum, simulated or real (docs/interfaces.md).
 
 All nodes take names, QoS and message layout from here. The names are relative, so that namespaces and remapping work.
-Units are SI, angles are in rad from the hanging position, a duty is a fraction 0..1, stamps are in ns.
+Units are SI, angles are in rad from the hanging position, a duty is a fraction 0..1 (-1..1 if the bridge reverses or
+brakes the motor), stamps are in ns.
 """
 
 import math
@@ -81,7 +82,7 @@ def armature_message(stamp_ns: int, v_a: float, i_a: float, duty: float) -> Batt
         stamp_ns: [ns] instant of sampling, since the epoch.
         v_a: [V] armature voltage.
         i_a: [A] armature current, positive when it drives the motor.
-        duty: duty applied from this sample to the next, 0..1.
+        duty: duty applied from this sample to the next, -1..1.
     """
     message = BatteryState(
         voltage=v_a,

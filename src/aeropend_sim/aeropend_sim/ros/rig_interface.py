@@ -76,7 +76,7 @@ class RigInterface(Node):
             omega: [rad/s] rotor speed.
             v_a: [V] armature voltage.
             i_a: [A] armature current.
-            duty: duty applied from this sample to the next, 0..1.
+            duty: duty applied from this sample to the next, -1..1.
         """
         self._joint_states.publish(interface.joint_states_message(stamp_ns, theta, omega))
         self._armature.publish(interface.armature_message(stamp_ns, v_a, i_a, duty))
