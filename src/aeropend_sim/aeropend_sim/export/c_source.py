@@ -14,9 +14,6 @@ _SCALARS = {float: "double", int: "int", bool: "int"}
 _CALLS = {"abs": "fabs", "max": "largest", "min": "smallest", "int": "(int)"}
 """Functions that C has by another name."""
 
-_RANK = {ast.IfExp: 1, ast.BoolOp: 2, ast.Compare: 4, ast.BinOp: 5, ast.UnaryOp: 7}
-"""How firmly C binds each kind of expression; products bind one more than sums."""
-
 _SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Mod: "%", ast.Lt: "<", ast.LtE: "<=",
           ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=", ast.And: "&&", ast.Or: "||", ast.USub: "-",
           ast.UAdd: "+",
