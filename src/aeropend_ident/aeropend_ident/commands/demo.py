@@ -27,7 +27,17 @@ from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import Model, load, save
 
 NUMBER_ERROR = 0.03
-"""Each number of the plant is off from the model by up to this share: no model's numbers are exact."""
+"""Each number of the plant is off from the model by up to this share (choice: no model's numbers are exact)."""
+
+
+def numbers_off(model: Model, rng: np.random.Generator) -> dict[str, float]:
+    """The numbers of a rig that are those of a model only nearly: each is off by up to `NUMBER_ERROR`, by chance.
+
+    Args:
+        model: the model.
+        rng: draws how far each is off.
+    """
+    return {k: v * (1.0 + NUMBER_ERROR * rng.uniform(-1.0, 1.0)) for k, v in model.model.items()}
 
 
 def draw(effect: str | None, seed: int | None) -> tuple[str, Model]:
@@ -42,7 +52,7 @@ def draw(effect: str | None, seed: int | None) -> tuple[str, Model]:
     """
     rng = np.random.default_rng(seed)
     bench = load("bench")
-    numbers = {k: v * (1.0 + NUMBER_ERROR * rng.uniform(-1.0, 1.0)) for k, v in bench.model.items()}
+    numbers = numbers_off(bench, rng)
     drawn = effect or str(rng.choice(list(CATALOGUE)))
     effects = {}
     if drawn != "none":

@@ -24,6 +24,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 from std_msgs.msg import Float64
 
+from aeropend_ident.commands.demo import numbers_off
 from aeropend_ident.commands.programs import check, environment, made, process
 from aeropend_sim.cli.command import Parser, as_seed, entry_point
 from aeropend_sim.model import effect_file
@@ -31,9 +32,6 @@ from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import Model, load, save
 from aeropend_sim.ros import interface
 from aeropend_sim.ros.transport import without_shared_memory
-
-NUMBER_ERROR = 0.03
-"""Each number of the plant is off from the model by up to this share (choice: as in the demo)."""
 
 LEARNED_S = 80.0
 """[s] After the start before which the effect does not begin: `watch` learns the rig first."""
@@ -87,7 +85,7 @@ def draw(folder: Path, effect: str | None, since: float | None, seed: int | None
     """
     rng = np.random.default_rng(seed)
     bench = load("bench")
-    numbers = {k: v * (1.0 + NUMBER_ERROR * rng.uniform(-1.0, 1.0)) for k, v in bench.model.items()}
+    numbers = numbers_off(bench, rng)
     drawn = effect or str(rng.choice(SWITCHED))
     at = LEARNED_S + SPREAD_S * float(rng.random()) if since is None else since
     name = f"late_{drawn}"
