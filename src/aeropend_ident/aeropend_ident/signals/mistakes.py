@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from aeropend_ident.bags.mending import mend
+from aeropend_ident.signals.signals import STILL
 from aeropend_sim.model.actuator import voltage
 from aeropend_sim.model.effects import CATALOGUE
 from aeropend_sim.model.parameters import Model
@@ -85,9 +86,6 @@ RUN_UP = 3.0
 
 STEADY = 0.2
 """Range of the voltage of a supply, over its median (choice: no supply sags more; that of a motor begins at 0)."""
-
-STILL = 0.01
-"""Width of the levels of the duty (choice)."""
 
 LATE = {"v_a": 0.1, "omega": 0.3}
 """[s] Least time by which a reading is ahead of its simulation where the duty is late, by channel (choice: a rotor of
