@@ -37,7 +37,7 @@ LEARNED_S = 80.0
 """[s] After the start before which the effect does not begin: `watch` learns the rig first."""
 
 SPREAD_S = 60.0
-"""[s] Within which it then begins."""
+"""[s] Within which it then begins (choice: nobody can guess when, and nobody waits for long)."""
 
 HOLD_S = (2.0, 5.0)
 """[s] Time between two references (choice)."""

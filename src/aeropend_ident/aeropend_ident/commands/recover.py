@@ -26,9 +26,10 @@ from aeropend_sim.cli.command import EXIT_CODES, Parser, entry_point
 from aeropend_sim.cli.progress import Show, nothing, progress
 
 CHECKPOINT_MESSAGES = 20_000
+"""Messages after which the new bag is made whole on disk and progress is shown (choice: 20 s of a rig's samples)."""
 
 LONGEST_IDL = 100_000
-"""Characters of an IDL definition."""
+"""Characters of an IDL definition that is read (choice; it bounds the time of rosbags' parser)."""
 _IDL_TEXT = re.compile(r'"(?:\\.|[^"\\])*"|//[^\n]*|/\*.*?\*/', re.DOTALL)
 _IDL_ANNOTATION = re.compile(r"@\w+\s*\([^()]*\)")
 

@@ -38,12 +38,17 @@ from aeropend_sim.ros.usage import no_options, usage
 from aeropend_sim.ros.worker import Worker
 
 HORIZON_NS = 1_000_000_000
-"""Messages may lie in a bag this much out of order, ns."""
+"""Messages may lie in a bag this much out of order, ns.
+
+Choice: a hundred batches of `record`, which writes one topic after another; it bounds the memory."""
 PAUSE_NS = 60_000_000_000
 """A pause that is longer is said before anything is sent, ns (choice: nobody waits so long without a word)."""
 SLEEP_S = 0.05
-"""The longest the thread sleeps without looking whether it is to end, s."""
+"""The longest the thread sleeps without looking whether it is to end, s (choice)."""
 ACKNOWLEDGE_S = 1.0
+"""How long the end waits for each topic until subscribers have the last messages, s.
+
+Choice: one that hangs holds up the end, so not long."""
 CLOCK = "/clock"
 
 SETTINGS = {
