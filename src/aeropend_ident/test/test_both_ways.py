@@ -91,15 +91,16 @@ def test_a_rig_that_nobody_calibrated_is_identified_both_ways_by_a_speed_with_a_
     assert_friction(conclusions)
 
 
-@pytest.mark.parametrize("held", [True, False])
-def test_a_speed_with_a_sign_is_held_from_pulse_to_pulse_or_sampled(held):
-    """A driver may give the speed of the pulses the sign of its command."""
+def test_a_speed_may_have_the_sign_of_the_command_though_it_is_held_from_pulse_to_pulse():
     read, truth = rig.record(off(LINEAR, 3).with_effects({"coulomb_friction": {"accel": FRICTION}}), DUTY, 5)
-    speed = np.copysign(read["omega"], truth["omega"]) if held else truth["omega"]
-    s, conclusions = found({**read, "omega": speed}, ("duty", "i_a", "v_a", "omega"), LINEAR)
-    assert (s.pulses is not None) is held
-    assert any("omega goes below 0 and is not held" in note for note in s.notes) is not held
+    signed = np.copysign(read["omega"], truth["omega"])
+    s, conclusions = found({**read, "omega": signed}, ("duty", "i_a", "v_a", "omega"), LINEAR)
+    assert s.pulses is not None
+    assert not s.pulses.false.any()
     assert_friction(conclusions)
+    sampled = as_signals(recording(T, read["theta"], DUTY, omega=truth["omega"]), LINEAR)
+    assert sampled.pulses is None
+    assert any("omega goes below 0 and is not held" in note for note in sampled.notes)
 
 
 def test_a_duty_below_0_brakes_where_the_model_does_not_reverse(driven):
