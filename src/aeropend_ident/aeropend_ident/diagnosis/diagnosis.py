@@ -236,9 +236,9 @@ def _without_harmful(fitted: CutChains, found: Found, joint: JointFit, gaps: Gap
                      progress: Progress) -> Measured:
     """Take out the effects that make the gap larger on data that no fit has used.
 
-    These have a negative part, or the others leave less without them, or the run diverges with them. Where the arm
-    rests in the held-out part, a part is one of the whole recording: then the held-out gap must not grow by a material
-    amount. One at a time, the most harmful first: of effects that stand in for each other, one may be needed.
+    These have a negative part, or the others leave less without them, or the run diverges with them. A part may be one
+    of the whole recording: so the held-out gap must not grow by a material amount. One at a time, the most harmful
+    first: of effects that stand in for each other, one may be needed.
     """
     tried: set[str] = set()
     parts = parts_of(found, joint, gaps, settings)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The share of each finding in the gap: what comes back on held-out data when it is taken out of the model."""
+"""The share of each finding in the squared gap: what comes back of it when the finding is taken out of the model."""
 
 from __future__ import annotations
 

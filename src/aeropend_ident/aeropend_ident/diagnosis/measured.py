@@ -221,14 +221,14 @@ def share_of_learned(now: Measured, learned: Learned, settings: Settings) -> Int
 
 
 def _parts_with_learned(found: Found, joint: JointFit, gaps: Gaps, settings: Settings) -> list[Part]:
-    """The same where the arm moves, with a learned term like another effect, and without false captures."""
-    moving, unknown = gaps.held_out.in_motion(), None
-    parts = gap_share.parts_of_effects(joint, moving, moving.gap(gaps.runs_before), settings.material, settings.jobs)
+    """The same with a learned term like another effect, and without false captures."""
+    judged, unknown = gaps.held_out.for_shares(explained=found.unknown is None), None
+    parts = gap_share.parts_of_effects(joint, judged, judged.gap(gaps.runs_before), settings.material, settings.jobs)
     if found.unknown is not None:
         # of a calibrated rig the noise is known: what exceeds it is missing in the model, though it may not repeat
         share = 1.0 if found.chains.policy.calibrated else gaps.repeats.of_stage(found.unknown.stage).share
         unknown = Repeatable(found.unknown.term.place, share)
-    return parts + gap_share.unexplained(moving.gap(gaps.runs_after), gaps.floors, found.statistical.gust, unknown)
+    return parts + gap_share.unexplained(judged.gap(gaps.runs_after), gaps.floors, found.statistical.gust, unknown)
 
 
 def parts_of_parameters(joint: JointFit, gaps: Gaps) -> list[Part]:

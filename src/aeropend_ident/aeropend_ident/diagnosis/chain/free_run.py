@@ -159,9 +159,11 @@ def _held_speed(omega: Array, rotor_angle: Array, signals: Signals) -> Array:
         return omega
     speed = mean_speed(rotor_angle, p.time, p.period, signals.period)
     last = np.searchsorted(p.index, np.arange(len(signals)), side="right") - 1
-    held = np.where(last >= 0, speed[np.maximum(last, 0)], 0.0)
-    # where the rig reads no speed, the model has stopped too if it would have shown one pulse at most
+    held = np.where(last >= 0, speed[np.maximum(last, 0)], omega)  # until a first interval is timed
+    # where the rig reads no speed, the model has stopped too if it would have shown one pulse at most; at first two,
+    # as one begins the interval that is timed
     stopped = signals.omega == 0.0
     back = np.maximum(np.arange(len(signals)) - round(sensing.SPEED_TIMEOUT / signals.period), 0)
-    slow = np.abs(rotor_angle - rotor_angle[back]) < p.period[0] * abs(p.omega[0])
+    turn = p.period[0] * abs(p.omega[0])
+    slow = np.abs(rotor_angle - rotor_angle[back]) < np.where(last >= 0, turn, 2.0 * turn)
     return np.where(stopped, np.where(slow, 0.0, omega), held)
