@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from aeropend_ident.diagnosis.chain.priors import CHAIN_SD, NOMINAL_SD, usual_size
-from aeropend_ident.diagnosis.chain.values import FILTER, PLACE_OF_PARAMETER, STAGES, with_values
+from aeropend_ident.diagnosis.chain.values import FILTER, PLACE_OF_PARAMETER, STAGES, stage_at, with_values
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis, hypotheses
 from aeropend_ident.estimation.parameter import Parameter
 from aeropend_sim.model.effects import DEFINED, RANDOM
@@ -87,9 +87,8 @@ def stages_of(effect: str) -> tuple[str, ...]:
         effect: its id.
     """
     e = DEFINED[effect]
-    if e.place == "sensing":
-        return {"v_a": ("actuator", "motor"), "i_a": ("motor",), "omega": ("motor",), "theta": ("arm",)}[e.reading]
-    return {"actuator": ("actuator",), "electrical": ("motor",), "rotor": ("motor",)}.get(e.place, ("arm",))
+    first = stage_at(e.place, e.reading)
+    return (first, "motor") if e.reading == "v_a" else (first,)  # the motor is fed with the voltage read
 
 
 def size_of(columns: Sequence[Column], sizes: Sequence[float]) -> float:

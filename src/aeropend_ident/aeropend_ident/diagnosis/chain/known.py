@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from aeropend_ident.diagnosis.chain.values import FILTER, PLACE_OF_CHANNEL, PLACE_OF_PARAMETER, STAGES, limits
+from aeropend_ident.diagnosis.chain.values import FILTER, PLACE_OF_PARAMETER, limits, stage_at
 from aeropend_ident.estimation.parameter import Parameter, key
 from aeropend_sim.model.effects import DEFINED, RANDOM
 
@@ -79,14 +79,9 @@ def stage_of(name: str) -> str:
     owner = key(name).owner
     if name == FILTER:
         return "arm"
-    place = DEFINED[owner].place if owner in DEFINED else PLACE_OF_PARAMETER[name]
-    if place == "sensing":
-        place = PLACE_OF_CHANNEL[DEFINED[owner].reading]
-    return next((stage for stage, places in PLACES_OF.items() if place in places), "arm")
-
-
-PLACES_OF = {stage: {PLACE_OF_PARAMETER[n] for n in names} for stage, names in STAGES.items()}
-"""Stage -> places of its parameters."""
+    if owner in DEFINED:
+        return stage_at(DEFINED[owner].place, DEFINED[owner].reading)
+    return stage_at(PLACE_OF_PARAMETER[name])
 
 
 def pooled(verdicts: Sequence[Known]) -> Known:

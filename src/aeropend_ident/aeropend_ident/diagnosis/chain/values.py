@@ -52,6 +52,21 @@ PLACE_OF_CHANNEL = {"v_a": "actuator", "i_a": "electrical", "omega": "rotor", "t
 """The place whose misfit a channel shows first."""
 
 
+PLACES_OF = {stage: {PLACE_OF_PARAMETER[n] for n in names} for stage, names in STAGES.items()}
+"""Stage -> places of its parameters."""
+
+
+def stage_at(place: str, reading: str = "") -> str:
+    """The first stage of the cut chain in which a term acts.
+
+    Args:
+        place: of the chain.
+        reading: that it changes, at place `sensing`.
+    """
+    at = PLACE_OF_CHANNEL[reading] if place == "sensing" else place
+    return next((stage for stage, places in PLACES_OF.items() if at in places), "arm")
+
+
 def with_values(model: Model, values: Values) -> Model:
     """The model with these values; initial states are left out.
 

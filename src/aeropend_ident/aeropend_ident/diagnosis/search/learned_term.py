@@ -19,6 +19,7 @@ from scipy.linalg import block_diag
 
 from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
 from aeropend_ident.diagnosis.chain.priors import nominal_parameters
+from aeropend_ident.diagnosis.chain.values import stage_at
 from aeropend_ident.diagnosis.policy import GOOD_ENOUGH
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis
 from aeropend_ident.diagnosis.search.free_curves import FOLDS, MOST_SAMPLES, knots_of
@@ -432,10 +433,11 @@ def quantity(chain: CutChain, form: Form, values: Mapping[str, float]) -> Array:
     """
     s = chain.signals
     known: dict[str, Array] = {}
-    if form.place == "actuator" or form.reading == "v_a":
+    stage = stage_at(form.place, form.reading)
+    if stage == "actuator":
         n = chain.valued(values).numbers()
         known = {"v": actuator.voltage(n, s.duty), "i_a": np.nan_to_num(chain.current)}
-    elif form.place in ("electrical", "rotor") or form.reading == "i_a":
+    elif stage == "motor":
         i, omega, _ = chain.motor(values)
         known = {"i_a": i, "omega": omega}
     else:
