@@ -135,6 +135,12 @@ def pid(rng: np.random.Generator) -> Callable[[float, float], float]:
 class Sizer:
     """Finds the size of an effect at which what no refit of the numbers absorbs is so many floors."""
 
+    room: tuple[float | Array, float | Array] = -OFF, OFF
+    """Least and greatest change of each number by a refit, relative."""
+
+    ridge = 0.0
+    """Added to the diagonal of the refit's matrix, where the readings do not determine all numbers."""
+
     def __init__(self, numbers: Mapping[str, float], sensing: Mapping[str, float], duty: Array) -> None:
         self.numbers, self.tau, self.duty = dict(numbers), sensing["angle_filter_tau"], duty
         rng = np.random.default_rng(0)
@@ -165,13 +171,19 @@ class Sizer:
         """All channels in floors as one vector."""
         return np.concatenate([readings[c] / self.floor[c] for c in self.floor])
 
-    def left(self, p: Array, gusts: Array) -> float:
-        """Floors RMS, in the worst channel, that a refit of the numbers leaves of the gap."""
+    def moved(self, p: Array, gusts: Array) -> Array:
+        """What effects change of the readings, all channels as one vector, in floors."""
         y, v, _ = plant.states(p, self.duty, gusts)
-        moved = self.stack(plant.shown(p, y, v)) - self.base
-        refit = lsq_linear(self.r, self.q.T @ moved, (-OFF, OFF)).x
-        rest = moved - self.q @ (self.r @ refit)
-        return float(np.sqrt(np.mean(rest.reshape(len(self.floor), -1) ** 2, axis=1)).max())
+        return self.stack(plant.shown(p, y, v)) - self.base
+
+    def rest(self, moved: Array) -> Array:
+        """What no refit of the numbers absorbs, (4, N), each channel in floors."""
+        refit = lsq_linear(self.r + self.ridge * np.eye(len(self.r)), self.q.T @ moved, self.room).x
+        return (moved - self.q @ (self.r @ refit)).reshape(len(self.floor), -1)
+
+    def left(self, moved: Array) -> float:
+        """Floors RMS, in the worst channel, that a refit of the numbers leaves of the gap."""
+        return float(np.sqrt(np.mean(self.rest(moved) ** 2, axis=1)).max())
 
     def size(self, make: Callable[[float], tuple[Array, Array]], start: float, goal: float, most: float = 30.0
              ) -> tuple[float, float]:
@@ -182,7 +194,7 @@ class Sizer:
         x, step = math.log(start), 1.0  # in logarithms
         known: list[tuple[float, float]] = []
         for _ in range(9):
-            y = math.log(max(self.left(*make(math.exp(x))), 1e-9) / goal)
+            y = math.log(max(self.left(self.moved(*make(math.exp(x)))), 1e-9) / goal)
             known.append((x, y))
             if abs(y) < 0.1:
                 break
@@ -205,16 +217,6 @@ class Weighed(Sizer):
         super().__init__(numbers, sensing, duty)
         off = np.array([nominal[n] / numbers[n] for n in NUMBERS if numbers[n] != 0.0])
         self.room = off * (1.0 - OFF) - 1.0 - ROUNDED, off * (1.0 + OFF) - 1.0 + ROUNDED
-
-    def moved(self, p: Array, gusts: Array) -> Array:
-        """What effects change of the readings, all channels as one vector, in floors."""
-        y, v, _ = plant.states(p, self.duty, gusts)
-        return self.stack(plant.shown(p, y, v)) - self.base
-
-    def rest(self, moved: Array) -> Array:
-        """What no refit of the numbers absorbs, (4, N), each channel in floors."""
-        refit = lsq_linear(self.r, self.q.T @ moved, self.room).x
-        return (moved - self.q @ (self.r @ refit)).reshape(len(self.floor), -1)
 
     def gap(self, moved: Array) -> float:
         """The mean square of that over the spread of each channel, of all channels: the squared gap."""

@@ -93,11 +93,7 @@ def small(effect: str, rig: cases.Weighed, rng: np.random.Generator) -> Drawn:
     place = OUTSIDE[effect][0] if effect in OUTSIDE else cases.PLACES[effect]
     drawn = Drawn(effect, place, own, gusts, rig.moved(_packed(rig, [(effect, own)]), gusts))
     goal = math.exp(rng.uniform(*np.log(SMALL)))
-    return drawn.scaled(rig, goal / max(_floors(rig.rest(drawn.moved)), 1e-3), LARGEST_SMALL)
-
-
-def _floors(rest: Array) -> float:
-    return float(np.sqrt(np.mean(rest**2, axis=1)).max())
+    return drawn.scaled(rig, goal / max(rig.left(drawn.moved), 1e-3), LARGEST_SMALL)
 
 
 def messy(rng: np.random.Generator, rig: cases.Weighed) -> tuple[list[Drawn], dict[str, float]]:

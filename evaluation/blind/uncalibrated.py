@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import odeint
-from scipy.optimize import lsq_linear
 
 from aeropend_ident.testing import bags
 from aeropend_sim.model.parameters import load
@@ -65,16 +64,11 @@ def _speed(n: Mapping[str, float], duty: Array) -> Array:
 class AngleSizer(cases.Sizer):
     """Finds the size of an effect at which what no refit of the numbers absorbs of the angle is so many floors."""
 
+    room, ridge = (-0.5, 0.5), 1e-9
+
     def __init__(self, numbers: Mapping[str, float], tau: float, duty: Array, floor: float) -> None:
         self.numbers, self.tau, self.duty, self.floor = dict(numbers), tau, duty, {"theta": floor}
         self.absorb(NUMBERS)
-
-    def left(self, p: Array, gusts: Array) -> float:
-        """Floors RMS that a refit of the numbers leaves of the gap."""
-        y, v, _ = plant.states(p, self.duty, gusts)
-        moved = self.stack(plant.shown(p, y, v)) - self.base
-        refit = lsq_linear(self.r + 1e-9 * np.eye(len(self.r)), self.q.T @ moved, (-0.5, 0.5)).x
-        return float(np.sqrt(np.mean((moved - self.q @ (self.r @ refit)) ** 2)))
 
 
 def driven(name: str, effect: str, form: str, nominal: Mapping[str, float], tau: float, seed: int,
