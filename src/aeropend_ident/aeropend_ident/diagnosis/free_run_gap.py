@@ -179,18 +179,14 @@ class HeldOut:
         rests = any(np.nanstd(s.theta[s.train:]) < STILL_ARM * np.nanstd(s.theta) for s in self.recordings)
         return self.everywhere() if rests else self
 
-    def for_shares(self, *, explained: bool) -> HeldOut:
-        """The same where the parts of the gap are measured.
+    def for_shares(self) -> HeldOut:
+        """The same where the parts of effects are measured.
 
         An effect may act in a part of the recording alone. The parameters of a calibrated rig are known within
         tolerances, and few beside its samples: the fitted part shows as well what comes back without an effect. Those
-        of an uncalibrated rig, and of a model that lacks something, follow what they were fitted to, so that only
-        held-out data tell.
-
-        Args:
-            explained: whether nothing but chance and small imperfections is left of the misfit.
+        of an uncalibrated rig follow what they were fitted to, so that only held-out data tell.
         """
-        return self.everywhere() if explained and self.chains.policy.calibrated else self.in_motion()
+        return self.everywhere() if self.chains.policy.calibrated else self.in_motion()
 
     def everywhere(self) -> HeldOut:
         """The same on the whole recordings."""

@@ -279,11 +279,12 @@ def shares(parts: Sequence[Part], *, shared: float = SHARED, ends: bool = True, 
     if total <= 0.0:
         return captures
     rng = np.random.default_rng(seed)
-    blocks = min(len(p.windows) for p in parts)
-    picks = rng.integers(0, blocks, (RESAMPLES, blocks)) if blocks > 1 else np.zeros((RESAMPLES, 1), dtype=np.intp)
+    # parts that were measured on the same windows are drawn together
+    picks = {n: rng.integers(0, n, (RESAMPLES, n)) if n > 1 else np.zeros((RESAMPLES, 1), dtype=np.intp)
+             for n in dict.fromkeys(len(p.windows) for p in parts)}
     # a size of the other sign closes nothing
     size = [np.maximum(1.0 + p.unsure * rng.standard_normal(RESAMPLES), 0.0) for p in parts]
-    drawn = np.array([p.windows[picks].mean(axis=1) * x**2 for p, x in zip(parts, size, strict=True)])
+    drawn = np.array([p.windows[picks[len(p.windows)]].mean(axis=1) * x**2 for p, x in zip(parts, size, strict=True)])
     drawn /= np.maximum(np.maximum(drawn, 0.0).sum(axis=0), total * LEAST_DRAWN)
     rest = np.sqrt(sum((np.maximum(d, 0.0) for p, d in zip(parts, drawn, strict=True) if p.name in ("", UNKNOWN)),
                        np.zeros(RESAMPLES)))

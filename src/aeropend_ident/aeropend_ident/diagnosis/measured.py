@@ -222,13 +222,16 @@ def share_of_learned(now: Measured, learned: Learned, settings: Settings) -> Int
 
 def _parts_with_learned(found: Found, joint: JointFit, gaps: Gaps, settings: Settings) -> list[Part]:
     """The same with a learned term like another effect, and without false captures."""
-    judged, unknown = gaps.held_out.for_shares(explained=found.unknown is None), None
+    held_out, unknown = gaps.held_out.in_motion(), None
+    # a learned term follows what it was fitted to
+    judged = held_out if found.learned is not None else gaps.held_out.for_shares()
     parts = gap_share.parts_of_effects(joint, judged, judged.gap(gaps.runs_before), settings.material, settings.jobs)
     if found.unknown is not None:
         # of a calibrated rig the noise is known: what exceeds it is missing in the model, though it may not repeat
         share = 1.0 if found.chains.policy.calibrated else gaps.repeats.of_stage(found.unknown.stage).share
         unknown = Repeatable(found.unknown.term.place, share)
-    return parts + gap_share.unexplained(judged.gap(gaps.runs_after), gaps.floors, found.statistical.gust, unknown)
+    after = held_out.gap(gaps.runs_after)
+    return parts + gap_share.unexplained(after, gaps.floors, found.statistical.gust, unknown)
 
 
 def parts_of_parameters(joint: JointFit, gaps: Gaps) -> list[Part]:

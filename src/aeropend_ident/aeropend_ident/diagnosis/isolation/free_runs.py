@@ -38,7 +38,7 @@ class FreeRuns:
         self.model = chains.model
         (self.signals,) = chains.recordings
         s = self.signals
-        held_out = HeldOut(chains, self.model, [s], spikes=False).for_shares(explained=True)
+        held_out = HeldOut(chains, self.model, [s], spikes=False).for_shares()
         self.judged = slice(s.train if held_out.part == "held out" else 0, len(s))
         self._run = StagedRun(self.model, s)
         self.readings = self._run.readings({})
