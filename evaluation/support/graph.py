@@ -10,7 +10,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -67,7 +67,8 @@ class Process:
     def __init__(self, name: str, *args: str) -> None:
         self.name = name
         self._output = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
-        self.popen = subprocess.Popen(self.command(*args), stdout=self._output, stderr=subprocess.STDOUT)
+        self.popen = subprocess.Popen(self.command(*args), stdout=self._output, stderr=subprocess.STDOUT,
+                                      env={**os.environ, "PYTHONFAULTHANDLER": "1"})
 
     def command(self, *args: str) -> list[str]:
         """What is run."""
@@ -113,19 +114,23 @@ class Process:
         return self
 
     def wait(self, timeout: float = PATIENCE_S) -> int:
-        """Wait for the end and return the exit code."""
-        return self.popen.wait(timeout)
+        """Wait for the end and return the exit code; if it does not end, say what each of its threads does."""
+        try:
+            return self.popen.wait(timeout)
+        except subprocess.TimeoutExpired:
+            self.popen.send_signal(signal.SIGABRT)  # its fault handler prints the threads
+            with suppress(subprocess.TimeoutExpired):
+                self.popen.wait(AGAIN_S)
+            self.popen.kill()
+            self.popen.wait()
+            raise AssertionError(f"{self.name} did not end within {timeout:g} s: {self.output}") from None
 
     def stop(self) -> int:
         """End it as Ctrl-C does and return the exit code; kill it when it does not."""
         if self.popen.poll() is None:
             self.popen.send_signal(signal.SIGCONT)
             self.popen.send_signal(signal.SIGINT)
-        try:
-            return self.popen.wait(PATIENCE_S)
-        finally:
-            self.popen.kill()
-            self.popen.wait()
+        return self.wait()
 
 
 def parameters(**values: object) -> list[str]:
