@@ -45,6 +45,8 @@ PATIENCE_S = 60.0
 """How long a test waits for what must come: discovery and a first compilation take long on a loaded machine."""
 AGAIN_S = 5.0
 """How long a service may take before it is asked again, s."""
+LAST_WORDS_S = 5.0
+"""How long a process that does not end may take to say what its threads do, s."""
 
 
 def isolate() -> None:
@@ -114,23 +116,29 @@ class Process:
         return self
 
     def wait(self, timeout: float = PATIENCE_S) -> int:
-        """Wait for the end and return the exit code; if it does not end, say what each of its threads does."""
+        """Wait for the end and return the exit code; if it does not end, say what each of its threads does.
+
+        Raises:
+            TimeoutExpired: with the output; the process has been aborted.
+        """
         try:
             return self.popen.wait(timeout)
         except subprocess.TimeoutExpired:
             self.popen.send_signal(signal.SIGABRT)  # its fault handler prints the threads
             with suppress(subprocess.TimeoutExpired):
-                self.popen.wait(AGAIN_S)
-            self.popen.kill()
-            self.popen.wait()
-            raise AssertionError(f"{self.name} did not end within {timeout:g} s: {self.output}") from None
+                self.popen.wait(LAST_WORDS_S)
+            raise subprocess.TimeoutExpired(f"{self.name}: {self.output}", timeout) from None
 
     def stop(self) -> int:
         """End it as Ctrl-C does and return the exit code; kill it when it does not."""
         if self.popen.poll() is None:
             self.popen.send_signal(signal.SIGCONT)
             self.popen.send_signal(signal.SIGINT)
-        return self.wait()
+        try:
+            return self.wait()
+        finally:
+            self.popen.kill()
+            self.popen.wait()
 
 
 def parameters(**values: object) -> list[str]:
