@@ -14,6 +14,9 @@ from aeropend_ident.diagnosis.search import free_curves
 from aeropend_ident.diagnosis.search.free_curves import Repeatable
 from aeropend_ident.estimation.parallel import parallel
 
+SHOWN = 0.005
+"""Share of the squared gap up to which what a channel leaves is not judged (derived: the report has whole per cent)."""
+
 
 class Repeats:
     """How much of what each stage leaves repeats; each stage is judged when it is first asked for.
@@ -49,17 +52,15 @@ def budget(before: Gap, after: Gap, floors: Mapping[str, float], repeats: Repeat
     bottom = before.total_floor(floors)
     if before.total <= (1.0 + NOTHING_OPEN) * bottom:
         return None
-    repeating = repeats.of_channels([c for c in after.rms if not (gust and c == "theta")], jobs)
-    repeatable, rest = 0.0, 0.0
-    places: dict[str, float] = {}
-    for channel, rms in after.rms.items():
-        amount = max(rms**2 - floors[channel] ** 2, 0.0) / after.spread[channel] ** 2 / len(after.rms)
-        if channel in repeating:
-            one = repeating[channel]
-            places[one.place] = places.get(one.place, 0.0) + one.share * amount
-            repeatable += one.share * amount
-        rest += amount
-    found = max(before.total**2 - after.total**2, 0.0)
+    amount = {c: max(rms**2 - floors[c] ** 2, 0.0) / after.spread[c] ** 2 / len(after.rms)
+              for c, rms in after.rms.items()}
+    found, rest = max(before.total**2 - after.total**2, 0.0), sum(amount.values())
     total = found + rest
+    shown = [c for c, x in amount.items() if x > SHOWN * total and not (gust and c == "theta")]
+    repeatable = 0.0
+    places: dict[str, float] = {}
+    for channel, one in repeats.of_channels(shown, jobs).items():
+        places[one.place] = places.get(one.place, 0.0) + one.share * amount[channel]
+        repeatable += one.share * amount[channel]
     return GapBudget(found / total, repeatable / total, (rest - repeatable) / total,
                      max(places, key=lambda p: places[p]) if repeatable > 0.0 else None)

@@ -199,15 +199,18 @@ def arm_response(drive: Array, stiffness: Array, damping: float, tau: float, h: 
     """
     out = np.empty_like(drive)
     keep = math.exp(-h / tau) if tau > 0.0 else 0.0
-    x, v, s1, s2 = np.zeros((4, drive.shape[0]))
+    step = np.empty((drive.shape[1], 6))
     for k in range(drive.shape[1]):
-        a, b, c, d, e, f = linear_arm(stiffness[k], damping, h)
-        for j in range(drive.shape[0]):
-            out[j, k] = s2[j]
+        step[k] = linear_arm(stiffness[k], damping, h)
+    for j in range(drive.shape[0]):
+        x = v = s1 = s2 = 0.0
+        for k in range(drive.shape[1]):
+            out[j, k] = s2
+            a, b, c, d, e, f = step[k]
             u = drive[j, k]
-            x[j], v[j] = a * x[j] + b * v[j] + c * u, d * x[j] + e * v[j] + f * u
-            s1[j] = keep * s1[j] + (1.0 - keep) * x[j]
-            s2[j] = keep * s2[j] + (1.0 - keep) * s1[j]
+            x, v = a * x + b * v + c * u, d * x + e * v + f * u
+            s1 = keep * s1 + (1.0 - keep) * x
+            s2 = keep * s2 + (1.0 - keep) * s1
     return out
 
 
@@ -234,18 +237,21 @@ def motor_response(voltage: Array, torque: Array, omega: Array, R_a: float, L_a:
     """
     i_out, w_out, angle_out = np.empty_like(voltage), np.empty_like(voltage), np.empty_like(voltage)
     decay = math.exp(-h * R_a / L_a)
-    over_hold, per_resistance, per_inertia = (1.0 - decay) * L_a / (R_a * h), 1.0 / R_a, h / J_m
-    i, w, angle = np.zeros((3, voltage.shape[0]))
-    for k in range(voltage.shape[1]):
-        slowed = 1.0 / (1.0 + per_inertia * (B_m + 2.0 * k_load * abs(omega[k])))
-        for j in range(voltage.shape[0]):
-            i_out[j, k], w_out[j, k], angle_out[j, k] = i[j], w[j], angle[j]
-            goal = (voltage[j, k] - K_e * w[j]) * per_resistance
-            mean = goal + (i[j] - goal) * over_hold
-            i[j] = goal + (i[j] - goal) * decay
-            after = (w[j] + per_inertia * (K_t * mean + torque[j, k])) * slowed
-            angle[j] += 0.5 * h * (w[j] + after)
-            w[j] = after
+    hold = (1.0 - decay) * L_a / (R_a * h)  # of the current at the beginning of a sample, in its mean
+    per_volt, mean_per_volt = (1.0 - decay) / R_a, (1.0 - hold) / R_a
+    per_inertia = h / J_m
+    pull = per_inertia * K_t
+    kept = 1.0 - pull * mean_per_volt * K_e
+    slowed = 1.0 / (1.0 + per_inertia * (B_m + 2.0 * k_load * np.abs(omega)))
+    for j in range(voltage.shape[0]):
+        i = w = angle = 0.0
+        for k in range(voltage.shape[1]):
+            i_out[j, k], w_out[j, k], angle_out[j, k] = i, w, angle
+            drive = pull * mean_per_volt * voltage[j, k] + per_inertia * torque[j, k]
+            after = (kept * w + (pull * hold * i + drive)) * slowed[k]
+            i = decay * i + per_volt * (voltage[j, k] - K_e * w)
+            angle += 0.5 * h * (w + after)
+            w = after
     return i_out, w_out, angle_out
 
 
@@ -423,7 +429,7 @@ class _System:
         residual: (N,) in units of a reading's noise, over all channels.
         z: (P,) parameters in standard units.
         jacobian: (P, N) sensitivities to them.
-        fold: (N,) block of time in which a row lies, 0 to `FOLDS` - 1.
+        blocks: rows of each of `FOLDS` blocks of time, one slice a channel.
         curves: place -> its curves.
         basis: place -> (K, N) the change by each value of its curves.
         random: (D, N) the same by random torques on the arm, if they were asked for.
@@ -432,27 +438,37 @@ class _System:
     residual: Array
     z: Array
     jacobian: Array
-    fold: NDArray[np.intp]
+    blocks: Sequence[Sequence[slice]]
     curves: Mapping[str, Columns]
     basis: Mapping[str, Array]
     random: Array | None
 
     def solved(self, place: str, spared: Array) -> tuple[MissingTerm, Array]:
         """The missing term at a place, and what it leaves of rows (D, N) beside the residual."""
-        basis, r, size, rows, information = self._normal(place)
-        solution = -np.linalg.solve(information, rows @ r + np.concatenate([self.z, np.zeros(len(basis))]))
-        rest = r + rows.T @ solution
-        left = spared.T - rows.T @ np.linalg.solve(information, rows @ spared.T)
-        term = MissingTerm(place, _curves(self.curves[place], solution[len(self.z):] / size), float(np.mean(rest**2)),
-                           float(np.mean(r * r)), len(r), effective_sample_size(rest))
-        return term, left
+        jacobian, basis, r = self.jacobian, self.basis[place], self.residual
+        count = len(jacobian)
+        information, size = self._normal(place)
 
-    def _normal(self, place: str) -> tuple[Array, Array, Array, Array, Array]:
-        basis, r = self.basis[place], self.residual
-        size = np.maximum(np.sqrt(np.mean(basis**2, axis=1)), 1e-12)
-        rows = np.vstack([self.jacobian, basis / size[:, None]])
-        stiff = np.full(len(basis), STIFF * len(r) / 1e3)
-        return basis, r, size, rows, rows @ rows.T + np.diag([*np.ones(len(self.z)), *stiff])
+        def explained(rows: Array, prior: Array | float = 0.0) -> tuple[Array, Array]:
+            """Values (P + K, D) with which the columns explain rows (D, N), and what they explain."""
+            products = np.concatenate([jacobian @ rows.T, basis @ rows.T]) + prior
+            values = np.linalg.solve(information, products / size[:, None]) / size[:, None]
+            return values, values[:count].T @ jacobian + values[count:].T @ basis
+
+        values, changes = explained(r[None, :], np.concatenate([self.z, np.zeros(len(basis))])[:, None])
+        rest = r - changes[0]
+        term = MissingTerm(place, _curves(self.curves[place], -values[count:, 0]), float(np.mean(rest**2)),
+                           float(np.mean(r * r)), len(r), effective_sample_size(rest))
+        return term, spared - explained(spared)[1]
+
+    def _normal(self, place: str) -> tuple[Array, Array]:
+        """Normal equations (P + K, P + K) of parameters and curves, with each curve in units of its RMS; these."""
+        jacobian, basis = self.jacobian, self.basis[place]
+        mixed, own = jacobian @ basis.T, basis @ basis.T
+        size = np.concatenate([np.ones(len(jacobian)), _rms_of_rows(own, len(self.residual))])
+        stiff = np.full(len(basis), STIFF * len(self.residual) / 1e3)
+        products = np.block([[jacobian @ jacobian.T, mixed], [mixed.T, own]]) / np.outer(size, size)
+        return products + np.diag(np.concatenate([np.ones(len(jacobian)), stiff])), size
 
     def predicted(self, place: str, stiffnesses: Sequence[float]) -> list[float]:
         """Mean square that curves at a place leave of each block of time if they are fitted to all others.
@@ -467,17 +483,26 @@ class _System:
             The mean square with each of them.
         """
         basis, r = self.basis[place], self.residual
-        rows = basis / np.maximum(np.sqrt(np.mean(basis**2, axis=1)), 1e-12)[:, None]
-        blocks = [(rows[:, self.fold == k], r[self.fold == k]) for k in range(FOLDS)]
-        products = [(x @ x.T, x @ y) for x, y in blocks]
-        gram, moment = sum(g for g, _ in products), sum(m for _, m in products)
+        products = [(sum(basis[:, rows] @ basis[:, rows].T for rows in block),
+                     sum(basis[:, rows] @ r[rows] for rows in block), sum(float(r[rows] @ r[rows]) for rows in block))
+                    for block in self.blocks]
+        size = _rms_of_rows(sum(own for own, *_ in products), len(r))
+        products = [(own / np.outer(size, size), mixed / size, square) for own, mixed, square in products]
+        gram, moment = sum(own for own, *_ in products), sum(mixed for _, mixed, _ in products)
         left = []
         for stiffness in stiffnesses:
-            prior = stiffness * len(r) * np.eye(len(rows))
-            solved = [np.linalg.solve(gram - g + prior, moment - m) for g, m in products]
-            squares = [float(np.sum((y - x.T @ one) ** 2)) for (x, y), one in zip(blocks, solved, strict=True)]
-            left.append(sum(squares) / len(r))
+            prior = stiffness * len(r) * np.eye(len(size))
+            squares = 0.0
+            for own, mixed, square in products:
+                values = np.linalg.solve(gram - own + prior, moment - mixed)
+                squares += square - 2.0 * float(values @ mixed) + float(values @ own @ values)
+            left.append(squares / len(r))
         return left
+
+
+def _rms_of_rows(gram: Array, count: int) -> Array:
+    """RMS of rows by their products (K, K) over `count` columns."""
+    return np.maximum(np.sqrt(np.diag(gram) / count), 1e-12)
 
 
 def _system(chains: CutChains, stage: str, base: Mapping[str, float], known: Sequence[Parameter], *,
@@ -489,7 +514,11 @@ def _system(chains: CutChains, stage: str, base: Mapping[str, float], known: Seq
     jacobian = search.stacked(search.jacobian())
     channels = [key(k) for k in search.weight]
     weight = np.concatenate([np.full(len(search.current[k]), w) for k, w in search.weight.items()])
-    fold = np.concatenate([np.arange(len(search.current[k])) * FOLDS // len(search.current[k]) for k in search.weight])
+    counts = [len(search.current[k]) for k in search.weight]
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    # row j of a channel's N is in block j FOLDS // N
+    blocks = [[slice(at - (-k * n // FOLDS), at - (-(k + 1) * n // FOLDS)) for at, n in zip(starts, counts)]
+              for k in range(FOLDS)]
     values = [chains.values_of(base, k) for k in range(len(chains.each))]
     variables_of, places_of = _OF_STAGE[stage]
     variables = [variables_of(chain, own) for chain, own in zip(chains.each, values, strict=True)]
@@ -511,7 +540,7 @@ def _system(chains: CutChains, stage: str, base: Mapping[str, float], known: Seq
     curves = {place: columns for place, (columns, _) in made[0].items()}
     basis = {place: -rows([m[place][1] for m in made], sum(len(c) for *_, c in columns))
              for place, columns in curves.items()}
-    return _System(np.concatenate([search.current[k] for k in search.weight]), search.z, jacobian / weight, fold,
+    return _System(np.concatenate([search.current[k] for k in search.weight]), search.z, jacobian / weight, blocks,
                    curves, basis, random)
 
 
