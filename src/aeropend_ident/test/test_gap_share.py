@@ -137,6 +137,12 @@ def test_an_effect_whose_size_may_be_nothing_is_no_claim():
         assert headline(parts, shares(parts), 0.03).effects == effects
 
 
+def test_an_effect_whose_size_may_be_nothing_is_doubtful_where_most_stays_unexplained():
+    for unsure, rest, doubtful in ((0.6, 2.0, {"cable_torque"}), (0.6, 0.5, set()), (0.4, 2.0, set())):
+        assert gap_share.doubtful([part("cable_torque", 1.0, unsure=unsure), part("", rest)]) == doubtful
+    assert gap_share.doubtful([part("cable_torque", 1.0, unsure=0.6), part(UNKNOWN, 2.0)]) == set()
+
+
 def test_false_captures_do_not_count_in_the_shares_of_others():
     found = shares([part(gap_share.CAPTURES, 1000.0), part("gust", 1.0), part("", 1.0)])
     assert found["gust"].value == 0.5

@@ -237,8 +237,9 @@ def _without_harmful(fitted: CutChains, found: Found, joint: JointFit, gaps: Gap
     """Take out the effects that make the gap larger on data that no fit has used.
 
     These have a negative part, or the others leave less without them, or the run diverges with them. A part may be one
-    of the whole recording: so the held-out gap must not grow by a material amount. One at a time, the most harmful
-    first: of effects that stand in for each other, one may be needed.
+    of the whole recording: so the held-out gap must not grow by a material amount. Doubtful effects are tried, too:
+    what is left without them may be an unknown effect. One at a time, the most harmful first: of effects that stand in
+    for each other, one may be needed.
     """
     tried: set[str] = set()
     parts = parts_of(found, joint, gaps, settings)
@@ -250,7 +251,8 @@ def _without_harmful(fitted: CutChains, found: Found, joint: JointFit, gaps: Gap
     def closes(p: Part) -> float:
         return min(p.amount, p.unique) if p.amount >= settings.material * gap_share.whole(parts) else p.amount
 
-    while harmful := [p for p in parts if (closes(p) < 0.0 or worse()) and p.name not in tried]:
+    while harmful := [p for p in parts if p.name not in tried
+                      and (closes(p) < 0.0 or worse() or p.name in gap_share.doubtful(parts))]:
         name = min(harmful, key=closes).name
         tried.add(name)  # a nominal parameter may take its part over only against what is known of it
         without = fit_and_measure(fitted, _without(found, name), progress)

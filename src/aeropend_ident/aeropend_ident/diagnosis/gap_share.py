@@ -339,6 +339,21 @@ def headline(parts: Sequence[Part], share: Mapping[str, Interval], material: flo
     return Headline(effects[0], first.place, effects, small, names)
 
 
+def doubtful(parts: Sequence[Part]) -> set[str]:
+    """Names of the effects that may close nothing, where most of the gap stays unexplained.
+
+    Another effect may be there: an effect of an unsure size must not hide it.
+
+    Args:
+        parts: of the gap.
+    """
+    open_ = sum(p.amount for p in parts if not p.name)
+    if open_ <= MOSTLY_OPEN * whole(parts):
+        return set()
+    share = shares(parts, shared=0.0, ends=False)
+    return {p.name for p in parts if p.unsure > 0.0 and p.name in share and share[p.name].low <= 0.0}
+
+
 def why_unsure(share: Mapping[str, Interval], material: float) -> str:
     """Why no effect is claimed although some have a material share of the gap; "" if none has.
 
