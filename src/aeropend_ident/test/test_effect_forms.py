@@ -101,4 +101,4 @@ def test_a_form_that_is_no_formula_leaves_the_strength_open():
     lag = other_forms(delay, chains)[0]
     f = replace(estimate({}, {}), residuals={"v_a": np.ones(100)})
     ranked = RankedHypothesis(lag, f, 1.0, 0.6, others=(RankedHypothesis(delay, f, 1.0, 0.4),))
-    assert Strengths(JointFit(chains, {}, f, {}, {}, {})).interval(ranked, "actuator", 0.0) is None
+    assert Strengths(JointFit(chains, {}, f, {}, {}, {}, {})).interval(ranked, "actuator", 0.0) is None

@@ -68,7 +68,7 @@ class Fitted:
         self.values = {p.name: 1.0 for effects in stages for h in effects for p in h.own}
         self.before = 2.0
 
-    def unsure(self, effect):
+    def unsure(self, effect, form):
         return 0.1
 
     def fit_without(self, wanted, jobs=1):

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The fits without an effect, with which its share of the gap is measured."""
 
+import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,3 +70,16 @@ def test_without_its_mismatch_a_number_is_back_within_its_tolerance():
     assert joint.values["R_a"] == pytest.approx(1.4 * BENCH.model["R_a"], rel=0.06)
     assert joint.without(effects)["R_a"] == pytest.approx(1.05196 * BENCH.model["R_a"], rel=1e-3)
     assert joint.without([])["R_a"] == pytest.approx(joint.values["R_a"], rel=0.05)
+
+
+def test_the_error_from_another_form_counts_for_a_size_as_far_as_it_is_asked_for():
+    duty = steps(15.0, 1)
+    columns, _ = rig.record(drawn_rig(1, {"brush_drop": {}}), duty, 1)
+    chains = CutChains(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)])
+    joint = fit_jointly(chains, search(chains, 2), gust=False)
+    (effect,), form = joint.findings["motor"].effects, 0.4
+    size = effect.own[0].name
+    joint = replace(joint, sd={**joint.sd, size: math.hypot(joint.sd_given_form[size], form * joint.values[size])})
+    without = joint.unsure(effect, form=0.0)
+    assert 0.0 < without <= joint.sd_given_form[size] / joint.values[size]
+    assert joint.unsure(effect, form=0.5) == pytest.approx(math.hypot(without, 0.5 * form))

@@ -86,6 +86,7 @@ class JointFit:
         fit: of everything.
         values: name -> estimate.
         sd: name -> standard deviation, with the uncertainty from the form of an effect.
+        sd_given_form: name -> the same without that uncertainty: as if each effect had its true form.
         checks: stage -> tests of what is left of it.
         alone: name -> estimate and standard deviation of each of several calibrated recordings, fitted alone.
     """
@@ -95,6 +96,7 @@ class JointFit:
     fit: Fit
     values: dict[str, float]
     sd: dict[str, float]
+    sd_given_form: dict[str, float]
     checks: dict[str, Check]
     alone: dict[str, tuple[Estimate, ...]] = field(default_factory=dict)
     _fitted_without: dict[tuple[frozenset[str], bool], dict[str, float]] = field(default_factory=dict, repr=False)
@@ -200,11 +202,17 @@ class JointFit:
         ends = (p.mean - TOLERANCE * p.sd, p.mean + TOLERANCE * p.sd, *also)
         return replace(p, low=max(p.low, min(ends)), high=min(p.high, max(ends)))
 
-    def unsure(self, effect: Hypothesis) -> float:
-        """Relative standard deviation of the size of an effect that was found; see `size_sd`."""
+    def unsure(self, effect: Hypothesis, form: float) -> float:
+        """Relative standard deviation of the size of an effect that was found; see `size_sd`.
+
+        Args:
+            effect: that was found.
+            form: part of the error from another form that counts.
+        """
         size = effect.own[0].name
         distance = abs(self.values[size] - neutral(self.chains.model, size))
-        return size_sd(effect, self.fit, self.sd) / max(distance, 1e-300)
+        of_form = math.sqrt(max(self.sd[size] ** 2 - self.sd_given_form[size] ** 2, 0.0))
+        return math.hypot(size_sd(effect, self.fit, self.sd_given_form), form * of_form) / max(distance, 1e-300)
 
     def expected_without(self, effects: Collection[Hypothesis]) -> dict[str, float]:
         """The values without some of the effects if the readings were linear in all of them."""
@@ -287,7 +295,7 @@ def fit_jointly(chains: CutChains, findings: Mapping[str, Findings], *, gust: bo
         found[stage] = taken_out(chains, found[stage], selection)
         joint, values, sd, alone = _fitted(chains, found)
         checks = _checks(chains, found)
-    return JointFit(chains, found, joint, values, widened(), checks, alone)
+    return JointFit(chains, found, joint, values, widened(), sd, checks, alone)
 
 
 def _fitted(chains: CutChains, findings: Mapping[str, Findings]
