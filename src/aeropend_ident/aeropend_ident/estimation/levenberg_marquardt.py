@@ -29,22 +29,13 @@ STEP = 1e-4
 
 Choice: well above rounding, well below curvature."""
 
-DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-5, 1e6
-"""Levenberg-Marquardt damping: first value, and its limits (choice)."""
+DAMPING, DAMPING_DOWN, DAMPING_UP, MOST_DAMPING = 1e-3, 0.2, 8.0, 1e6
+"""Levenberg-Marquardt damping: first value, factors after a step that succeeds and one that fails, and where it ends.
 
-DAMPING_DOWN, DAMPING_UP = 1.0 / 3.0, 2.0
-"""Factors of the damping after a step as good as expected, and after one that fails; the latter doubles each time.
+Choice; any factors from 0.1 and 10 on lead to the same minimum."""
 
-Convention: H. Nielsen, Damping Parameter in Marquardt's Method, IMM-REP-1999-05, Technical University of Denmark,
-1999."""
-
-STRAIGHT = 0.75
-"""Share of the expected decrease below which a step is tried on a curved path, too (choice)."""
-
-GOOD_STEP = 0.5
-"""Share of the expected decrease below which the derivatives are computed anew, rather than corrected.
-
-Choice: with 0.25 to 0.75 fits end alike; in curved valleys this takes the fewest runs."""
+GOOD_STEP = 0.75
+"""Share of the expected decrease below which the derivatives are computed anew, rather than corrected (choice)."""
 
 STEADY = 0.1
 """Relative change of a derivative over a step, once it is corrected, up to which it is not computed anew.
@@ -104,7 +95,6 @@ class Search:
         self.due = True  # whether derivatives are computed before the next step
         self.fresh = self.whole = False  # whether derivatives were computed at this point; all of them
         self.ended = False
-        self.damping = DAMPING
         self.renew_weights()
 
     def at(self, z: Array) -> dict[str, Array]:
@@ -271,11 +261,6 @@ class Search:
         r = self.stack(residuals)
         return _Trial(z, residuals, float(r @ r + z @ self.prior @ z))
 
-    def relax(self, gained: float, expected: float) -> None:
-        """Set the damping after a step that succeeds: the less, the more of the expected decrease is gained."""
-        ratio = min(gained / max(expected, TINY), 1.0)
-        self.damping = max(self.damping * max(DAMPING_DOWN, 1.0 - (2.0 * ratio - 1.0)**3), LEAST_DAMPING)
-
     def improve(self, steps: int, deadline: float | None = None, *, first_look: bool = False) -> Products:
         """Take Levenberg-Marquardt steps with the weights as they are.
 
@@ -287,7 +272,7 @@ class Search:
         Returns:
             Products of the last `normal_equations`.
         """
-        products = Products()
+        damping, products = DAMPING, Products()
         for done in range(steps):
             if done and passed(deadline):
                 break
@@ -298,35 +283,31 @@ class Search:
             information, gradient, products = self.normal_equations(self.weighted(self.slopes))
             cost = float(r @ r + self.z @ self.prior @ self.z)
             enough = ENOUGH + ENOUGH_OF_EXCESS * max(cost - sum(self.ess.values()), 0.0)
-            gained, good, bent = 0.0, True, False
-            short, up = self.damping > DAMPING, DAMPING_UP
-            while self.damping < MOST_DAMPING:
-                damped = information + self.damping * np.diag(np.diag(information))
+            gained, straight, bent = 0.0, True, False
+            while damping < MOST_DAMPING:
+                damped = information + damping * np.diag(np.diag(information))
                 step = self.step(damped, gradient)
                 trial = self._tried(step)
                 expected = -float(step @ (2.0 * gradient + information @ step))
-                bent = self.fresh and cost - trial.cost < STRAIGHT * expected and expected > enough
+                straight = cost - trial.cost >= GOOD_STEP * expected
+                bent = self.fresh and not straight and expected > enough
                 if bent:
                     trial = min(trial, self._tried(self.bent(step, damped)), key=lambda one: one.cost)
-                good = cost - trial.cost >= GOOD_STEP * expected
                 if trial.cost < cost:
                     gained, moved = cost - trial.cost, trial.z - self.z
                     self.slopes = {k: s.corrected(moved, trial.residuals[k] - self.current[k])
                                    for k, s in self.slopes.items()}
                     self.z, self.current = trial.z, trial.residuals
-                    self.relax(gained, expected)
+                    damping *= DAMPING_DOWN
                     break
                 if not self.fresh:
                     break
-                self.damping *= up
-                up *= 2.0
+                damping *= DAMPING_UP
             ended = gained < enough
-            if ended and short:  # a short step gains little: longer ones may gain more
-                self.damping = DAMPING
-            self.ended = ended and (self.whole or first_look) and not bent and not short
+            self.ended = ended and (self.whole or first_look) and not bent
             if self.ended:
                 break
-            self.due = ended or not good
+            self.due = ended or not straight
             if ended and self.fresh:  # all derivatives confirm the end
                 self.steady[:] = False
             self.fresh = self.whole = False
