@@ -2,6 +2,7 @@
 """Sets of effects: the log evidence of a linear model, and effects that stood in for others."""
 
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis, adopted
-from aeropend_ident.diagnosis.search.hypotheses import hypotheses
+from aeropend_ident.diagnosis.search.hypotheses import hypotheses, other_forms
 from aeropend_ident.diagnosis.search.search import _without_unneeded
 from aeropend_ident.diagnosis.search.sets import LinearStage, compared, names, with_best_set
 from aeropend_ident.estimation.linear_sets import LinearSets
@@ -130,6 +131,24 @@ def test_the_sets_that_are_likely_are_those_whose_fits_are(chains):
     assert [s.probability for s in others] == sorted((s.probability for s in others), reverse=True)
     fits = [found_alone(chains, *s.effects)[0].final for s in (first, *others)]
     assert all(f.log_evidence(first_ess := fits[0].ess) < fits[0].log_evidence(first_ess) + 3.0 for f in fits)
+
+
+def test_two_effects_that_stand_in_for_one_of_another_form_give_way_to_it():
+    effects = {"encoder_lag": {"tau": 0.027}, "quadratic_drag": {"k": 0.4}}
+    columns, _ = rig.record(drawn_rig(8, effects), duty := steps(20.0, 8), 8)
+    chains = CutChains(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)])
+    findings, nominal, candidates = found_alone(chains, "encoder_lag", "thrust_lag", "quadratic_drag")
+    lag = next(h for h in candidates if h.effect == "encoder_lag")
+    (single,) = other_forms(lag, chains)
+    known = reduce(adopted, [single, *findings.effects[1:]], nominal)
+    start = {"encoder_lag_single.lag": 0.04, "thrust_lag.tau": 0.014, "quadratic_drag.k": 0.4}
+    final = fit(chains.residuals("arm"), started(known, {**findings.base.values, **start}))
+    assert final.values["thrust_lag.tau"] == pytest.approx(0.014, rel=0.3)
+    first = RankedHypothesis(single, final, 10.0, 1.0, (findings.found[0][0],))
+    wrong = replace(findings, final=final, found=((first,), *findings.found[1:]))
+    right = _without_unneeded(chains, wrong, nominal, 0.0)
+    assert [h.name for h in right.effects] == ["encoder_lag", "quadratic_drag"]
+    assert right.final.values["encoder_lag.tau"] == pytest.approx(0.027, rel=0.1)
 
 
 def test_an_effect_that_closes_less_than_a_trifle_is_taken_out(chains):

@@ -109,25 +109,25 @@ def adopted(known: list[Parameter], hypothesis: Hypothesis, start: int = 0) -> l
     return [*(p for p in known if p.name not in {o.name for o in own}), *own]
 
 
-def drop_unneeded(findings: Findings, without: Callable[[Findings, Hypothesis], Fit],
-                  lost: Callable[[Findings, Fit], float], least: int = 0, jobs: int = 1) -> Findings:
+def drop_unneeded(findings: Findings, without: Callable[[Findings, Selection], Findings],
+                  lost: Callable[[Findings, Findings], float], least: int = 0, jobs: int = 1) -> Findings:
     """Take out effects that are not needed beside the others, the least needed first (backward elimination).
 
     Args:
         findings: of a stage.
-        without: fits what was found without one effect.
-        lost: log evidence that such a fit has less than the final fit.
+        without: the findings without one effect, the others fitted again.
+        lost: log evidence that these have less, without prior odds.
         least: number of effects that stay in any case.
         jobs: processes.
     """
     while len(findings.found) > least:
-        effects = findings.effects
-        fits = parallel(jobs, partial(without, findings), effects)
-        needed = [lost(findings, f) + h.log_odds for h, f in zip(effects, fits, strict=True)]
+        odds = sum(h.log_odds for h in findings.effects)
+        fewer = parallel(jobs, partial(without, findings), findings.found)
+        needed = [lost(findings, f) + odds - sum(h.log_odds for h in f.effects) for f in fewer]
         k = needed.index(min(needed))
         if needed[k] > 0.0:
             break
-        findings = findings.without(findings.found[k], fits[k])
+        findings = fewer[k]
     return findings
 
 

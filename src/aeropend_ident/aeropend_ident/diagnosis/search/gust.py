@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from aeropend_ident.diagnosis.search.findings import Findings, RankedHypothesis,
 from aeropend_ident.diagnosis.search.free_curves import hats, knots_of, missing_terms
 from aeropend_ident.diagnosis.search.gauss_markov import Gust, fit_gust, follows_state, gauss_markov
 from aeropend_ident.diagnosis.search.hypotheses import Hypothesis
-from aeropend_ident.diagnosis.search.search import refit
+from aeropend_ident.diagnosis.search.search import taken_out
 from aeropend_ident.estimation.map_fit import Fit, estimate, largest_ess
 from aeropend_ident.signals.signals import Signals
 
@@ -125,12 +126,9 @@ def _judged(chains: CutChains, final: Fit) -> RankedHypothesis | None:
 
 def _without_random(chains: CutChains, arm: Findings) -> Findings:
     """The findings without effects that are not needed beside a random torque, which resembles many an effect."""
-    def without(now: Findings, h: Hypothesis) -> Fit:
-        return refit(chains, "arm", [e for e in now.effects if e is not h], now.final.values, now.base)
+    def lost(now: Findings, fewer: Findings) -> float:
+        ess = largest_ess([now.final, fewer.final])
+        simpler = fewer.final.log_occam(ess) - now.final.log_occam(ess)
+        return track(chains, now.final).log_likelihood - track(chains, fewer.final).log_likelihood - simpler
 
-    def lost(now: Findings, f: Fit) -> float:
-        ess = largest_ess([now.final, f])
-        simpler = f.log_occam(ess) - now.final.log_occam(ess)
-        return track(chains, now.final).log_likelihood - track(chains, f).log_likelihood - simpler
-
-    return drop_unneeded(arm, without, lost)
+    return drop_unneeded(arm, partial(taken_out, chains), lost)

@@ -41,7 +41,7 @@ from aeropend_ident.diagnosis.search.selection import (
 )
 from aeropend_ident.diagnosis.search.sets import compared, with_best_set
 from aeropend_ident.estimation.deadline import passed
-from aeropend_ident.estimation.map_fit import Fit, fit, fit_again, largest_ess
+from aeropend_ident.estimation.map_fit import Fit, covariance_of, fit, fit_again, largest_ess
 from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter, started
 
@@ -67,6 +67,11 @@ Measured: at ±30 % no verdict of 22 recordings changes (docs/results/thresholds
 
 UNNEEDED = 1e9
 """[nats] Log evidence by which an effect that closes a trifle counts as unneeded (choice: more than any evidence)."""
+
+STANDS_IN = 0.5
+"""Squared correlation of the sizes of two effects above which one may stand in for the other.
+
+Derived: more than half of the variance of its size is that of the other's."""
 
 EVEN = 0.5
 """Probability of all hypotheses of a round together above which an effect is found.
@@ -304,12 +309,18 @@ def _with_best_forms(chains: CutChains, findings: Findings, nominal: list[Parame
     """Choose the form of each effect again beside the others: alone, it may have stood in for one of them."""
     if len(findings.found) < 2:
         return findings
-    for k, (first, *rivals) in enumerate(findings.found):
+    for k, (first, *_) in enumerate(findings.found):
         if first.others:
-            best, *others = _forms_beside(chains, findings, _beside(findings, nominal, first.hypothesis), first, jobs)
-            found = (replace(best, others=shared(best, others)), *rivals)
-            findings = replace(findings, found=(*findings.found[:k], found, *findings.found[k + 1:]), final=best.fit)
+            findings = _in_best_form(chains, findings, k, nominal, jobs)
     return findings
+
+
+def _in_best_form(chains: CutChains, findings: Findings, k: int, nominal: list[Parameter], jobs: int) -> Findings:
+    """The findings with the k-th effect in the form that is best beside the others."""
+    first, *rivals = findings.found[k]
+    best, *others = _forms_beside(chains, findings, _beside(findings, nominal, first.hypothesis), first, jobs)
+    found = (replace(best, others=shared(best, others)), *rivals)
+    return replace(findings, found=(*findings.found[:k], found, *findings.found[k + 1:]), final=best.fit)
 
 
 def _forms_beside(chains: CutChains, findings: Findings, beside: list[Parameter], first: RankedHypothesis,
@@ -345,17 +356,37 @@ def _alike(chains: CutChains, findings: Findings, f: Fit) -> bool:
 
 def _without_unneeded(chains: CutChains, findings: Findings, nominal: list[Parameter], trifle: float, jobs: int = 1
                       ) -> Findings:
-    """Take out effects that are not needed beside the others, and those that close no more than a trifle."""
-    def without(now: Findings, h: Hypothesis) -> Fit:
-        return fit(chains.residuals(now.stage), started(_beside(now, nominal, h), now.final.values))
+    """Take out effects that are not needed beside the others, and those that close no more than a trifle.
 
-    def lost(now: Findings, f: Fit) -> float:
-        closes = squared_gap(chains, f, CHANNELS_OF[now.stage]) - squared_gap(chains, now.final, CHANNELS_OF[now.stage])
-        if closes <= trifle and not at_end_of_prior(chains, now.stage, f):
+    Two effects may stand in for one of another form: a lag of the thrust and one stage of the angle's filter, say, for
+    both stages. So without an effect, the one that may stand in for it has its form chosen again.
+    """
+    def without(now: Findings, selection: Selection) -> Findings:
+        others = _beside(now, nominal, selection[0].hypothesis)
+        fewer = now.without(selection, fit(chains.residuals(now.stage), started(others, now.final.values)))
+        k = _stand_in(now, selection[0].hypothesis, fewer)
+        return fewer if k is None else _in_best_form(chains, fewer, k, nominal, 1)
+
+    def lost(now: Findings, fewer: Findings) -> float:
+        closes = (squared_gap(chains, fewer.final, CHANNELS_OF[now.stage])
+                  - squared_gap(chains, now.final, CHANNELS_OF[now.stage]))
+        if closes <= trifle and not at_end_of_prior(chains, now.stage, fewer.final):
             return closes - UNNEEDED
-        return now.final.evidence_over(f)
+        return now.final.evidence_over(fewer.final)
 
     return drop_unneeded(findings, without, lost, 1, jobs)
+
+
+def _stand_in(now: Findings, h: Hypothesis, fewer: Findings) -> int | None:
+    """Number, without an effect, of the one with other forms that may stand in for it; None if none may."""
+    names, covariance = list(now.final.values), covariance_of(now.final.information(now.final.ess))
+
+    def shared_variance(k: int) -> float:
+        i, j = (names.index(x.own[0].name) for x in (h, fewer.found[k][0].hypothesis))
+        return float(covariance[i, j] ** 2 / (covariance[i, i] * covariance[j, j]))
+
+    formed = [k for k, (first, *_) in enumerate(fewer.found) if first.others and shared_variance(k) > STANDS_IN]
+    return max(formed, key=shared_variance, default=None)
 
 
 def refit(chains: CutChains, stage: str, effects: Sequence[Hypothesis], start: Mapping[str, float],
