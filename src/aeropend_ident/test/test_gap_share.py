@@ -64,12 +64,13 @@ class Fitted:
 
     def __init__(self, stages, fixed, again):
         self.findings = {f"stage {k}": SimpleNamespace(effects=effects) for k, effects in enumerate(stages)}
-        self.chains, self.fixed, self.again = SimpleNamespace(known=None), fixed, again
+        self.chains = SimpleNamespace(known=None, policy=SimpleNamespace(calibrated=True))
+        self.fixed, self.again = fixed, again
         self.values = {p.name: 1.0 for effects in stages for h in effects for p in h.own}
         self.before = 2.0
 
     def unsure(self, effect, form):
-        return 0.1
+        return 0.2 * form
 
     def fit_without(self, wanted, jobs=1):
         pass
@@ -129,6 +130,13 @@ def test_an_effect_closes_no_more_than_the_nominal_model_leaves():
     fitted.before = 0.09
     assert fitted.parts()["a"].amount == pytest.approx(-0.01)
     assert fitted.parts()["a"].unique == pytest.approx(-0.01)
+
+
+def test_of_an_uncalibrated_rig_all_of_the_error_from_another_form_counts():
+    fitted = Fitted([[effect("a")]], {"": 0.0, "a": 1.0}, {})
+    assert fitted.parts()["a"].unsure == pytest.approx(0.1)
+    fitted.chains.policy.calibrated = False
+    assert fitted.parts()["a"].unsure == pytest.approx(0.2)
 
 
 def test_an_effect_whose_size_may_be_nothing_is_no_claim():

@@ -131,8 +131,11 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, before: Gap, material: 
     gaps[_names(every)] = min(gaps[_names(every)], before, key=squared)
     again = {h.name: gap(every) if len(every) == 1 else held_out.gap_of(joint.without([h], others=True)) for h in tried}
 
+    # the numbers of an uncalibrated rig may be wrong as a whole: what curves explain then speaks against all effects
+    form = SHARED if joint.chains.policy.calibrated else 1.0
+
     def part(effect: Hypothesis, effects: Sequence[Hypothesis]) -> Part:
-        unsure = min(joint.unsure(effect, form=SHARED), LARGEST_UNSURE)
+        unsure = min(joint.unsure(effect, form), LARGEST_UNSURE)
         last, first, alone = (_coming_back(effect.name, effect.place, gap(without), gap(with_), unsure)
                               for without, with_ in (([effect], []), (effects, _but(effects, effect)),
                                                      (every, _but(every, effect))))
