@@ -2,8 +2,8 @@
 import numpy as np
 import pytest
 
-from aeropend_ident.diagnosis.search.free_curves import arm_response
 from aeropend_ident.diagnosis.search.gauss_markov import fit_gust, follows_state, gauss_markov
+from aeropend_ident.diagnosis.search.linear_response import arm_response
 from aeropend_ident.testing.rigs import drawn_rig, steps
 from aeropend_sim.model import rig
 from aeropend_sim.model.parameters import SAMPLE_PERIOD

@@ -251,9 +251,12 @@ def _without_harmful(fitted: CutChains, found: Found, joint: JointFit, gaps: Gap
     def closes(p: Part) -> float:
         return min(p.amount, p.unique) if p.amount >= settings.material * gap_share.whole(parts) else p.amount
 
-    while harmful := [p for p in parts if p.name not in tried
-                      and (closes(p) < 0.0 or worse() or p.name in gap_share.doubtful(parts))]:
-        name = min(harmful, key=closes).name
+    def harmful() -> list[Part]:
+        every, doubtful = worse(), gap_share.doubtful(parts)
+        return [p for p in parts if p.name not in tried and (every or closes(p) < 0.0 or p.name in doubtful)]
+
+    while some := harmful():
+        name = min(some, key=closes).name
         tried.add(name)  # a nominal parameter may take its part over only against what is known of it
         without = fit_and_measure(fitted, _without(found, name), progress)
         less = without[2].after.total

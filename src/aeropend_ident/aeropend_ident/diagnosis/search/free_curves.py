@@ -14,12 +14,14 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate
 from statistics import fmean
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
+from aeropend_ident.diagnosis.search.linear_response import arm_response, motor_response
 from aeropend_ident.estimation.levenberg_marquardt import Search
 from aeropend_ident.estimation.map_fit import Fit
 from aeropend_ident.estimation.parameter import Parameter, key, started
@@ -27,9 +29,7 @@ from aeropend_ident.estimation.residuals import finite
 from aeropend_ident.signals.pulses import mean_speed
 from aeropend_ident.signals.smoothing import lag
 from aeropend_ident.signals.statistics import effective_sample_size
-from aeropend_sim.compiled import njit
 from aeropend_sim.model import sensing
-from aeropend_sim.model.arm import linear_arm
 
 Array = NDArray[np.float64]
 
@@ -183,78 +183,6 @@ def hats(x: Array, knots: Array) -> Array:
     return out
 
 
-@njit(nogil=True)
-def arm_response(drive: Array, stiffness: Array, damping: float, tau: float, h: float) -> Array:
-    """First-order response of the angle read to torques on the arm.
-
-    Args:
-        drive: [rad/s²] (K, N) torques over inertia.
-        stiffness: [1/s²] (N,) of the arm at its angle.
-        damping: [1/s] of the arm.
-        tau: [s] time constant of each of the two stages of the angle's filter.
-        h: [s] sample period.
-
-    Returns:
-        [rad] (K, N).
-    """
-    out = np.empty_like(drive)
-    keep = math.exp(-h / tau) if tau > 0.0 else 0.0
-    step = np.empty((drive.shape[1], 6))
-    for k in range(drive.shape[1]):
-        step[k] = linear_arm(stiffness[k], damping, h)
-    for j in range(drive.shape[0]):
-        x = v = s1 = s2 = 0.0
-        for k in range(drive.shape[1]):
-            out[j, k] = s2
-            a, b, c, d, e, f = step[k]
-            u = drive[j, k]
-            x, v = a * x + b * v + c * u, d * x + e * v + f * u
-            s1 = keep * s1 + (1.0 - keep) * x
-            s2 = keep * s2 + (1.0 - keep) * s1
-    return out
-
-
-@njit(nogil=True)
-def motor_response(voltage: Array, torque: Array, omega: Array, R_a: float, L_a: float, K_e: float, K_t: float,
-                   J_m: float, B_m: float, k_load: float, h: float) -> tuple[Array, Array, Array]:
-    """First-order response of the motor to voltages in the winding and torques on the rotor.
-
-    Args:
-        voltage: [V] (K, N).
-        torque: [N·m] (K, N).
-        omega: [rad/s] (N,) speed around which the motor is linear.
-        R_a: [Ω] winding resistance.
-        L_a: [H] winding inductance.
-        K_e: [V·s/rad] back-EMF constant.
-        K_t: [N·m/A] torque constant.
-        J_m: [kg·m²] rotor inertia.
-        B_m: [N·m·s/rad] viscous friction.
-        k_load: [N·m·s²/rad²] aerodynamic load.
-        h: [s] sample period.
-
-    Returns:
-        [A] current, [rad/s] speed and [rad] rotor angle, (K, N) each.
-    """
-    i_out, w_out, angle_out = np.empty_like(voltage), np.empty_like(voltage), np.empty_like(voltage)
-    decay = math.exp(-h * R_a / L_a)
-    hold = (1.0 - decay) * L_a / (R_a * h)  # of the current at the beginning of a sample, in its mean
-    per_volt, mean_per_volt = (1.0 - decay) / R_a, (1.0 - hold) / R_a
-    per_inertia = h / J_m
-    pull = per_inertia * K_t
-    kept = 1.0 - pull * mean_per_volt * K_e
-    slowed = 1.0 / (1.0 + per_inertia * (B_m + 2.0 * k_load * np.abs(omega)))
-    for j in range(voltage.shape[0]):
-        i = w = angle = 0.0
-        for k in range(voltage.shape[1]):
-            i_out[j, k], w_out[j, k], angle_out[j, k] = i, w, angle
-            drive = pull * mean_per_volt * voltage[j, k] + per_inertia * torque[j, k]
-            after = (kept * w + (pull * hold * i + drive)) * slowed[k]
-            i = decay * i + per_volt * (voltage[j, k] - K_e * w)
-            angle += 0.5 * h * (w + after)
-            w = after
-    return i_out, w_out, angle_out
-
-
 Columns = list[tuple[str, str, Array, Array]]
 """Curves at a place before they are fitted: variable, unit, knots (K,), columns (K, N)."""
 
@@ -304,14 +232,6 @@ class _Stage:
         for j, (a, b) in enumerate(zip(first, last, strict=True)):
             columns[j, a:b] = np.maximum(1.0 - np.abs(t[a:b] - knots[j]) / MOMENT, 0.0)
         return [(FREE_IN_TIME, unit, knots, columns)]
-@njit(nogil=True)
-def _lagged(x: Array, keep: float) -> Array:
-    out = np.empty_like(x)
-    s = x[0]
-    for k in range(len(x)):
-        s = keep * s + (1.0 - keep) * x[k]
-        out[k] = s
-    return out
 
 
 def _stacked(columns: Columns) -> Array:
@@ -513,12 +433,11 @@ def _system(chains: CutChains, stage: str, base: Mapping[str, float], known: Seq
     search = Search(lambda values: residuals({**base, **values}), started(here, base))
     jacobian = search.stacked(search.jacobian())
     channels = [key(k) for k in search.weight]
-    weight = np.concatenate([np.full(len(search.current[k]), w) for k, w in search.weight.items()])
     counts = [len(search.current[k]) for k in search.weight]
-    starts = np.concatenate([[0], np.cumsum(counts)])
-    # row j of a channel's N is in block j FOLDS // N
-    blocks = [[slice(at - (-k * n // FOLDS), at - (-(k + 1) * n // FOLDS)) for at, n in zip(starts, counts)]
-              for k in range(FOLDS)]
+    weight = np.repeat(list(search.weight.values()), counts)
+    ends = [[end - n + math.ceil(k * n / FOLDS) for k in range(FOLDS + 1)]
+            for end, n in zip(accumulate(counts), counts, strict=True)]
+    blocks = [[slice(e[k], e[k + 1]) for e in ends] for k in range(FOLDS)]
     values = [chains.values_of(base, k) for k in range(len(chains.each))]
     variables_of, places_of = _OF_STAGE[stage]
     variables = [variables_of(chain, own) for chain, own in zip(chains.each, values, strict=True)]

@@ -41,7 +41,7 @@ from aeropend_ident.diagnosis.search.selection import (
 )
 from aeropend_ident.diagnosis.search.sets import compared, with_best_set
 from aeropend_ident.estimation.deadline import passed
-from aeropend_ident.estimation.map_fit import Fit, covariance_of, fit, fit_again, largest_ess
+from aeropend_ident.estimation.map_fit import Fit, fit, fit_again, largest_ess
 from aeropend_ident.estimation.parallel import parallel
 from aeropend_ident.estimation.parameter import Parameter, started
 
@@ -379,11 +379,11 @@ def _without_unneeded(chains: CutChains, findings: Findings, nominal: list[Param
 
 def _stand_in(now: Findings, h: Hypothesis, fewer: Findings) -> int | None:
     """Number, without an effect, of the one with other forms that may stand in for it; None if none may."""
-    names, covariance = list(now.final.values), covariance_of(now.final.information(now.final.ess))
+    size = h.own[0].name
 
     def shared_variance(k: int) -> float:
-        i, j = (names.index(x.own[0].name) for x in (h, fewer.found[k][0].hypothesis))
-        return float(covariance[i, j] ** 2 / (covariance[i, i] * covariance[j, j]))
+        other = fewer.found[k][0].hypothesis.own[0].name
+        return 1.0 - (now.final.sd_given(size, [other]) / now.final.sd[size]) ** 2
 
     formed = [k for k, (first, *_) in enumerate(fewer.found) if first.others and shared_variance(k) > STANDS_IN]
     return max(formed, key=shared_variance, default=None)
