@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from aeropend_ident.signals import smoothing
 from aeropend_ident.signals.signals import Signals
 from aeropend_ident.signals.smoothing import block_mean
-from aeropend_sim.model import actuator, dynamics
-from aeropend_sim.model.coefficients import prepare
+from aeropend_sim.compiled import njit
+from aeropend_sim.model import actuator
 from aeropend_sim.model.effects import CATALOGUE, THRUST_PIVOT_SPEED
 from aeropend_sim.model.parameters import Model
-from aeropend_sim.model.state import State
 
 Array = NDArray[np.float64]
 
@@ -137,18 +136,36 @@ def curve(numbers: Mapping[str, float], dead: float, bend: float, load: float, l
 
 
 def unit_lift(model: Model, s: Signals) -> Array:
-    """Thrust (N,) over k_thrust for a duty: the speed squared, unless an effect of the thrust changes that."""
+    """Thrust (N,) over k_thrust for a duty: the speed squared, unless an effect of the thrust changes that.
+
+    The winding is far faster than the rotor: it is taken as a lag of the voltage, whose mean over a sample turns it.
+    """
     n = model.numbers()
     hangs = abs(float(np.mean(s.theta[np.isfinite(s.theta)][:3]))) < HANGS
     before = 0.0 if hangs else float(s.duty[0])
     v = actuator.acting_voltage(n, s.duty, model.effects, s.period, before=before)
-    state = State(omega=0.0 if hangs else float(actuator.speed_at(n, v[0])))
-    out = np.empty((3, len(v)))
-    dynamics.run_motor(v, state, *prepare(model.with_effects({}), s.period), out)
+    winding = n["L_a"] / n["R_a"] / s.period
+    v = v + winding * math.expm1(-1.0 / winding) * np.diff(v, prepend=v[0])
+    torque = n["K_t"] / (n["R_a"] * n["J_m"])
+    w = _speed(torque * v, 0.0 if hangs else float(actuator.speed_at(n, v[0])),
+               torque * n["K_e"] + n["B_m"] / n["J_m"], n["k_load"] / n["J_m"], s.period, math.ceil(s.period / COARSE))
     pivot = THRUST_PIVOT_SPEED
-    u = np.sign(out[1]) * pivot**2 * (np.abs(out[1]) / pivot) ** model.effect("thrust_exponent", "n")
+    u = np.sign(w) * pivot**2 * (np.abs(w) / pivot) ** model.effect("thrust_exponent", "n")
     tau = model.effect("thrust_lag", "tau")
     return smoothing.lag(u, tau, s.period, model.effect("thrust_lag", "fall")) if tau > 0.0 else u
+
+
+@njit(nogil=True)
+def _speed(drive: Array, speed: float, damping: float, load: float, period: float, steps: int) -> Array:
+    """[rad/s] ω (N,) of ω̇ = drive - damping ω - load ω|ω|, by the exponential Rosenbrock-Euler method; drive held."""
+    out = np.empty_like(drive)
+    for k in range(len(drive)):
+        out[k] = speed
+        for _ in range(steps):
+            slope = damping + 2.0 * load * abs(speed)
+            weight = -np.expm1(-slope * period / steps) / slope
+            speed += weight * (drive[k] - damping * speed - load * speed * abs(speed))
+    return out
 
 
 class WeakForm:
