@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 
+from aeropend_ident.diagnosis.chain.weak_start import rotor_speed
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.identification import dataset
 from aeropend_ident.identification.discrepancy import nominal
@@ -34,9 +35,10 @@ SECONDS = 6.0
 
 
 def _diagnoses() -> None:
-    """Diagnoses: with effects that are found, and with one that is left out of the catalogue."""
+    """Diagnoses: with effects that are found, and with one left out; and the start of an uncalibrated rig."""
     diagnose(rigs.BENCH, [rigs.recorded(3, {"coulomb_friction": {}, "brush_drop": {}, "gust": {}}, SECONDS)])
     diagnose(rigs.BENCH, [rigs.recorded(3, {"ground_effect": {}}, SECONDS)], left_out=("ground_effect",))
+    rotor_speed(rigs.BENCH, rigs.recorded(3, {}, SECONDS))
 
 
 def _equations() -> None:

@@ -38,7 +38,7 @@ from aeropend_ident.diagnosis.chain.weak_start import (
     curve,
     downsampled,
     regress,
-    unit_lift,
+    rotor_speed,
 )
 from aeropend_ident.diagnosis.policy import Policy, angle_only, policy_of
 from aeropend_ident.estimation.map_fit import Fit, fit
@@ -184,8 +184,7 @@ def _start_of_motor(chains: CutChains) -> Model:
         numbers = curve(n, dead, bend, load, lag)
         squares, scale = 0.0, []
         for s in recordings:
-            lift, seen = unit_lift(replace(model, model=numbers), s), s.true_speed
-            w = np.sign(lift) * np.sqrt(np.abs(lift))
+            w, seen = rotor_speed(replace(model, model=numbers), s), s.true_speed
             known = np.isfinite(seen)
             scale.append(float(w[known] @ seen[known]) / max(float(w[known] @ w[known]), 1e-12))
             squares += float(np.sum((seen[known] - scale[-1] * w[known]) ** 2))

@@ -136,27 +136,32 @@ def curve(numbers: Mapping[str, float], dead: float, bend: float, load: float, l
 
 
 def unit_lift(model: Model, s: Signals) -> Array:
-    """Thrust (N,) over k_thrust for a duty: the speed squared, unless an effect of the thrust changes that.
-
-    The winding is far faster than the rotor: it is taken as a lag of the voltage, whose mean over a sample turns it.
-    """
-    n = model.numbers()
-    hangs = abs(float(np.mean(s.theta[np.isfinite(s.theta)][:3]))) < HANGS
-    before = 0.0 if hangs else float(s.duty[0])
-    v = actuator.acting_voltage(n, s.duty, model.effects, s.period, before=before)
-    winding = n["L_a"] / n["R_a"] / s.period
-    v = v + winding * math.expm1(-1.0 / winding) * np.diff(v, prepend=v[0])
-    torque = n["K_t"] / (n["R_a"] * n["J_m"])
-    w = _speed(torque * v, 0.0 if hangs else float(actuator.speed_at(n, v[0])),
-               torque * n["K_e"] + n["B_m"] / n["J_m"], n["k_load"] / n["J_m"], s.period, math.ceil(s.period / COARSE))
+    """Thrust (N,) over k_thrust for a duty: the speed squared, unless an effect of the thrust changes that."""
+    w = rotor_speed(model, s)
     pivot = THRUST_PIVOT_SPEED
     u = np.sign(w) * pivot**2 * (np.abs(w) / pivot) ** model.effect("thrust_exponent", "n")
     tau = model.effect("thrust_lag", "tau")
     return smoothing.lag(u, tau, s.period, model.effect("thrust_lag", "fall")) if tau > 0.0 else u
 
 
+def rotor_speed(model: Model, s: Signals) -> Array:
+    """[rad/s] Speed (N,) of the rotor for a duty, near enough for a start.
+
+    The winding is far faster than the rotor: it is taken as a lag of the voltage, whose mean over a sample turns it.
+    """
+    n = model.numbers()
+    hangs = abs(float(np.mean(s.theta[np.isfinite(s.theta)][:3]))) < HANGS
+    v = actuator.acting_voltage(n, s.duty, model.effects, s.period, before=0.0 if hangs else float(s.duty[0]))
+    first = 0.0 if hangs else float(actuator.speed_at(n, v[0]))
+    tau = n["L_a"] / n["R_a"] / s.period
+    v = v + tau * math.expm1(-1.0 / tau) * np.diff(v, prepend=v[0])
+    torque = n["K_t"] / (n["R_a"] * n["J_m"])
+    damping, load = torque * n["K_e"] + n["B_m"] / n["J_m"], n["k_load"] / n["J_m"]
+    return np.asarray(_turned(torque * v, first, damping, load, s.period, math.ceil(s.period / COARSE)))
+
+
 @njit(nogil=True)
-def _speed(drive: Array, speed: float, damping: float, load: float, period: float, steps: int) -> Array:
+def _turned(drive: Array, speed: float, damping: float, load: float, period: float, steps: int) -> Array:
     """[rad/s] ω (N,) of ω̇ = drive - damping ω - load ω|ω|, by the exponential Rosenbrock-Euler method; drive held."""
     out = np.empty_like(drive)
     for k in range(len(drive)):
