@@ -163,7 +163,7 @@ def test_a_filter_within_its_tolerance_is_no_effect(factor):
                                               ("speed_tick", 4.0), ("current_lsb", 2.0)])
 def test_a_measurement_chain_that_is_off_is_no_effect_of_the_rig(name, factor):
     sensing = {**BENCH.sensing, name: factor * BENCH.sensing[name]}
-    duty = steps(28.0, 96)
+    duty = steps(20.0, 96)
     columns, _ = rig.record(Model("rig", drawn_rig(96, {}).model, sensing), duty, 96)
     which = diagnose(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)]).body["which"]
     assert set(which["effects"]) <= {"encoder_lag"}
@@ -182,7 +182,7 @@ def filtered(factor):
     """A recording of a rig whose filter has another time constant than the model file states; fine resolution."""
     sensing = {**BENCH.sensing, "angle_filter_tau": factor * BENCH.sensing["angle_filter_tau"], "angle_lsb": 1e-4,
                "angle_noise": 2e-4}
-    duty = steps(28.0, 74)
+    duty = steps(20.0, 74)
     columns, _ = rig.record(Model("rig", BENCH.model, sensing), duty, 74)
     return from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, {**BENCH.sensing, "angle_lsb": 1e-4})
 
@@ -299,7 +299,7 @@ def far_off(number, factor):
     """The document of a rig with one parameter off by a factor."""
     model = drawn_rig(80, {})
     model = Model("rig", {**model.model, number: factor * BENCH.model[number]}, model.sensing)
-    duty = steps(28.0, 80)
+    duty = steps(20.0, 80)
     columns, _ = rig.record(model, duty, 80)
     found = diagnose(BENCH, [from_arrays({**columns, "duty": duty}, SAMPLE_PERIOD, BENCH.sensing)])
     made = document(found, ["bag"], "bench", 0.0)
@@ -370,7 +370,7 @@ def with_friction():
 @pytest.mark.parametrize("missing", [1000, 5000])
 def test_a_test_recording_whose_angle_comes_late_is_judged_from_there_on(missing):
     found = with_friction()
-    duty = steps(28.0, 99)
+    duty = steps(20.0, 99)
     columns, _ = rig.record(drawn_rig(97, {"coulomb_friction": {}}), duty, 99)
     columns["theta"] = columns["theta"].copy()
     columns["theta"][:missing] = np.nan

@@ -61,7 +61,7 @@ def changing(seed: int, effects: dict[str, dict[str, float]], since: float = 0.0
     return from_arrays(columns, SAMPLE_PERIOD, BENCH.sensing)
 
 
-def recorded(seed: int, effects: dict[str, dict[str, float]] | None = None, duration: float = 28.0,
+def recorded(seed: int, effects: dict[str, dict[str, float]] | None = None, duration: float = 20.0,
              off: float = 0.02, without: tuple[str, ...] = ()) -> Signals:
     """A recording of such a rig; channels in `without` are missing."""
     duty = steps(duration, seed)
