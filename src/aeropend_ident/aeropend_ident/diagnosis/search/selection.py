@@ -17,6 +17,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import softmax
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.priors import absent, nominal_parameters, nominal_sd
@@ -317,8 +318,9 @@ class SelectionRound:
 
         The true effect then has another form than the catalogue's. Each rival is given free curves at its own place.
         The right one needs them for its form only. A wrong one cannot correct, from its place, an error that arises
-        elsewhere. The likelihoods with free curves divide the total probability of the close rivals. If free curves
-        explain the whole misfit with none of them, more than a form is missing, and the evidence decides.
+        elsewhere. The likelihoods with free curves divide the total probability of the close rivals among the places;
+        the evidence divides it among those at one place. If free curves explain the whole misfit with none of them,
+        more than a form is missing, and the evidence decides.
 
         Args:
             ranked: the best first.
@@ -337,13 +339,18 @@ class SelectionRound:
         if min(x for x, _ in left) > FORM_SHOWS:  # more than a form is missing: what curves add may be another effect
             return ranked
         count = max(n for _, n in left)
-        evidence = np.array([-0.5 * count * math.log(max(x, 1.0)) for x, _ in left])
-        weights = np.exp(evidence - evidence.max())
-        weights *= sum(r.probability for r in close) / weights.sum()
-        again = [replace(r, probability=float(p)) for r, p in zip(close, weights, strict=True)]
-        order = {id(r): -float(e) for r, e in zip(again, evidence, strict=True)}
+        places: dict[str, float] = {}
+        for r, (x, _) in zip(close, left, strict=True):
+            evidence = -0.5 * count * math.log(max(x, 1.0))
+            places[r.hypothesis.place] = max(places.get(r.hypothesis.place, -np.inf), evidence)
+        of_place = dict(zip(places, softmax([*places.values()]), strict=True))
+        total, again = sum(r.probability for r in close), []
+        for place in sorted(places, key=lambda place: -places[place]):
+            mine = [r for r in close if r.hypothesis.place == place]
+            shares = total * of_place[place] * softmax([r.gain for r in mine])
+            again += [replace(r, probability=float(p)) for r, p in zip(mine, shares, strict=True)]
         rest = [r for r in ranked if all(r is not c for c in close)]
-        return [*sorted(again, key=lambda r: order[id(r)]), *rest]
+        return [*again, *rest]
 
     def _fits(self, starts: Sequence[_Start]) -> list[Fit]:
         return parallel(self.jobs, self._fit, starts)
