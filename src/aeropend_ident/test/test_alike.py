@@ -17,7 +17,8 @@ BY_NAME = {h.name: h for h in hypotheses(BENCH)}
 OPEN, LEAST = 1.0, 0.004
 
 
-def taken(monkeypatch, left, probability, mean_square, first="encoder_eccentricity", rival="angle_offset"):
+def taken(monkeypatch, left, probability, mean_square, first="encoder_eccentricity", rival="angle_offset",
+          imperfect=()):
     """The effect that is found, where the rival leaves this much of the gap."""
     base, one, other = (estimate({}, {}) for _ in range(3))
     gaps = {id(base): OPEN, id(one): LEAST, id(other): left}
@@ -26,7 +27,7 @@ def taken(monkeypatch, left, probability, mean_square, first="encoder_eccentrici
     selection = (RankedHypothesis(BY_NAME[first], one, 30.0, 1.0 - probability),
                  RankedHypothesis(BY_NAME[rival], other, 20.0, probability))
     chains = SimpleNamespace(policy=CALIBRATED, known=None)
-    after = with_simpler(chains, Findings("arm", base, one, found=(selection,)))
+    after = with_simpler(chains, Findings("arm", base, one, found=(selection,)), imperfect)
     assert after.final is (one if after.effects[0].name == first else other)
     return after.effects[0].name
 
@@ -40,6 +41,15 @@ def taken(monkeypatch, left, probability, mean_square, first="encoder_eccentrici
 def test_of_effects_that_close_as_much_the_one_with_fewer_parameters_comes_first(
         monkeypatch, left, probability, mean_square, name):
     assert taken(monkeypatch, left, probability, mean_square) == name
+
+
+@pytest.mark.parametrize(("left", "imperfect", "name"), [
+    (2.1 * LEAST, "encoder_eccentricity", "angle_offset"),
+    (2.1 * LEAST, "coulomb_friction", "encoder_eccentricity"),
+    (LEAST + 1.1 * MATERIAL_SHARE * OPEN, "encoder_eccentricity", "encoder_eccentricity")])
+def test_beside_small_imperfections_the_evidence_of_a_further_parameter_does_not_count(
+        monkeypatch, left, imperfect, name):
+    assert taken(monkeypatch, left, 0.0, 1.0, imperfect=[imperfect]) == name
 
 
 @pytest.mark.parametrize("rival", ["cable_torque", "parameter_mismatch:mgd_over_J"])

@@ -241,10 +241,14 @@ def test_a_learned_term_closes_the_gap_of_an_effect_that_is_not_in_the_catalogue
     assert found.conclusions.closure.closed > 0.95
 
 
+def left_gaps(rms, floor=0.0):
+    """A gap of the angle above this floor."""
+    return SimpleNamespace(after=Gap({"theta": rms}, {"theta": 1.0}, np.full((1, 1), rms**2)), floors={"theta": floor})
+
+
 def left(rms, floor, parts=()):
     """Findings that leave this gap above this floor."""
-    gaps = SimpleNamespace(after=Gap({"theta": rms}, {"theta": 1.0}, np.full((1, 1), rms**2)), floors={"theta": floor})
-    return Measured(None, None, gaps, [Part(name, "arm", x, np.zeros(1)) for name, x in parts])
+    return Measured(None, None, left_gaps(rms, floor), [Part(name, "arm", x, np.zeros(1)) for name, x in parts])
 
 
 @pytest.mark.parametrize(("rms", "closes_more"), [(0.19, True), (0.199, False), (0.21, False)])
@@ -272,6 +276,24 @@ def test_effects_with_which_the_run_diverges_are_taken_out(monkeypatch):
     start = frozenset("ab")
     found = diagnosis._without_harmful(None, start, None, measured(None, start, None)[2], Settings(), None).found
     assert found == {"a"}
+
+
+@pytest.mark.promise("Verdict", "Small imperfections beside an effect do not make it one with more parameters")
+@pytest.mark.parametrize(("small", "left", "name"), [
+    ("ab", 0.2, "simple"), ("a", 0.2, "complex"), ("ab", 0.3, "complex")])
+def test_of_effects_that_close_as_much_the_simplest_is_taken_if_there_are_small_ones_beside_it(
+        monkeypatch, small, left, name):
+    def found(name, rms):
+        stages = {"arm": SimpleNamespace(name=name)}
+        return Measured(SimpleNamespace(chains=None, stages=stages), None, left_gaps(rms),
+                        [Part(n, "arm", x, np.full(1, x)) for n, x in [(name, 1.0), *((n, 0.01) for n in small)]])
+
+    monkeypatch.setattr(diagnosis, "replace", lambda found, stages: stages["arm"].name)
+    monkeypatch.setattr(diagnosis, "with_simpler",
+                        lambda chains, f, claimed: SimpleNamespace(name="simple") if f.name in claimed else f)
+    monkeypatch.setattr(diagnosis, "measured", lambda fitted, name, *_: found(name, left))
+    taken = diagnosis._among_imperfections(None, found("complex", 0.19), Settings(), None)
+    assert taken.found.stages["arm"].name == name
 
 
 @pytest.mark.promise("Verdict", "A model whose free run runs away is refused in one line")

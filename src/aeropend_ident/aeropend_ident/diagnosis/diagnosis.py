@@ -75,6 +75,9 @@ NOT_LEARNED = "the missing term was not learned, to bound the time: with more --
 CHANGED = 1.5
 """RMS early in the held-out part over that in the fitted part above which the rig changes there (choice)."""
 
+SEVERAL = 2
+"""Effects of less than a material share from which a rig has small imperfections (choice: more than one by chance)."""
+
 FURTHEST = 0.9
 """Share of such a recording that is fitted (choice: two thirds of what is usually held out)."""
 
@@ -182,6 +185,7 @@ def _diagnose(fitted: CutChains, settings: Settings, progress: Progress) -> Diag
         again.likely = {}
         again.notes = (*again.notes, *(note for note in found.recordings[0].notes if note == CUT_SHORT))
         return _diagnose(again, settings, progress)
+    now = _among_imperfections(fitted, now, settings, progress)
     if now.found.unknown is not None and not _repeats(now.parts, settings.material):
         known = replace(now.found, unknown=None)
         now = now._replace(found=known, parts=parts_of(known, now.joint, now.gaps, settings))
@@ -264,6 +268,22 @@ def _without_harmful(fitted: CutChains, found: Found, joint: JointFit, gaps: Gap
             found, joint, gaps = without
             parts = parts_of(found, joint, gaps, settings)
     return Measured(found, joint, gaps, parts)
+
+
+def _among_imperfections(fitted: CutChains, now: Measured, settings: Settings, progress: Progress) -> Measured:
+    """The simplest effects that close as much of the gap, if the rig has small imperfections beside them.
+
+    The further parameters of an effect then describe some of these, with much evidence and for little of the gap.
+    """
+    share = gap_share.shares(now.parts)
+    claimed = {p.name for p in now.parts if p.name in share and share[p.name].value >= settings.material}
+    if sum(p.name in share and p.name not in claimed for p in now.parts) < SEVERAL:
+        return now
+    stages = {b: with_simpler(now.found.chains, f, claimed) for b, f in now.found.stages.items()}
+    if all(f is now.found.stages[b] for b, f in stages.items()):
+        return now
+    simpler = measured(fitted, replace(now.found, stages=stages), settings, progress)
+    return now if simpler.gaps.after.diverges or now.closes_more(simpler, settings.material) else simpler
 
 
 def _with_learned_term(fitted: CutChains, now: Measured, settings: Settings, progress: Progress) -> Measured:

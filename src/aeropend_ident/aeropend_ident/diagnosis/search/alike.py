@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -65,7 +65,7 @@ def _alike(chains: CutChains, findings: Findings, before: Fit, first: RankedHypo
     return least, [r for r in found if r.more < MATERIAL_SHARE * (open_ - least)]
 
 
-def with_simpler(chains: CutChains, findings: Findings) -> Findings:
+def with_simpler(chains: CutChains, findings: Findings, imperfect: Collection[str] = ()) -> Findings:
     """The findings of a stage with the simplest of the effects that close as much, each in the place of the one found.
 
     An effect with more parameters takes up some of what neither explains. So one with fewer comes first if the evidence
@@ -75,17 +75,20 @@ def with_simpler(chains: CutChains, findings: Findings) -> Findings:
     Args:
         chains: cut.
         findings: of the stage.
+        imperfect: names of effects for which the evidence does not count: there are small imperfections beside them,
+            and their further parameters describe some of those.
     """
     if not chains.policy.calibrated or chains.known is not None:
         return findings
     before = findings.base
     for selection in findings.found:
         first, *rest = selection
-        shows = mean_square(first.fit, findings.stage) >= FORM_SHOWS
+        other = first.hypothesis.name in imperfect
+        shows = other or mean_square(first.fit, findings.stage) >= FORM_SHOWS
         simpler = [r for r in rest if len(r.hypothesis.own) < len(first.hypothesis.own)
                    and (shows or r.probability > CALIBRATED.undecided)]
         least, alike = _alike(chains, findings, before, first, simpler)
-        alike = [r for r in alike if r.ranked.probability > CALIBRATED.undecided or r.more < least]
+        alike = [r for r in alike if other or r.ranked.probability > CALIBRATED.undecided or r.more < least]
         before = first.fit
         if alike:
             best = min(alike, key=lambda r: len(r.ranked.hypothesis.own))
