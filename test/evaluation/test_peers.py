@@ -24,7 +24,7 @@ def test_every_optimizer_of_the_regression_works(optimizer: str) -> None:
 
 
 def test_a_rig_as_its_model_gives_none() -> None:
-    signals = rigs.recorded(6, {}, off=0.01)
+    signals = rigs.recorded(6, {}, 28.0, off=0.01)
     none = {"effects": [], "place": "none"}
     for said in (peers.sparse_regression(signals), peers.stepwise_bic(signals)):
         assert {k: said[k] for k in none} == none
