@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Effects that begin or end during a recording are found with their instant."""
 
+from collections import defaultdict
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.diagnosis.results import document, verdict_lines
+from aeropend_ident.diagnosis.search import onset
 from aeropend_ident.diagnosis.search.onset import SHORTEST, _located, with_window
 from aeropend_ident.testing.rigs import BENCH, changing, recorded
 
@@ -50,3 +54,14 @@ def test_a_change_in_the_part_that_is_held_out_at_first_or_just_before(effect, s
     assert made.conclusions.which.effects == (effect,)
     assert f"begins at {since:.1f}" in text
     assert any("only the rest is held out" in note for s in made.signals for note in s.notes)
+
+
+def test_a_stage_whose_rest_has_no_instant_does_not_hide_one_further_on(monkeypatch):
+    """The noise of the voltage is 5 % larger than stated; a friction begins."""
+    monkeypatch.setattr(onset, "stages_of", lambda *_: defaultdict(tuple))
+    monkeypatch.setattr(onset, "passes_as_noise", lambda f, _: f == "passes")
+    windows = {"actuator": [], "arm": [(700, 1000)]}
+    monkeypatch.setattr(onset, "_best_windows", lambda chains, stage, *_: windows[stage])
+    findings = {stage: SimpleNamespace(base=SimpleNamespace(residuals={"": 0.0}), final=final)
+                for stage, final in (("actuator", "open"), ("motor", "passes"), ("arm", "open"))}
+    assert onset.suspected(CutChains(BENCH, [recorded(38, duration=5.0)]), findings) == windows["arm"]

@@ -147,7 +147,7 @@ def _left_at_its_place(found: _Within, stage: str) -> float:
 
 
 def suspected(chains: CutChains, findings: Mapping[str, Findings]) -> list[Window]:
-    """The windows that explain most in the first stage that is not explained, if any stands out.
+    """The windows that explain most in the first stage that is not explained and where one stands out.
 
     Two effects that are alike may fit about as well, each within a window of its own.
 
@@ -157,15 +157,13 @@ def suspected(chains: CutChains, findings: Mapping[str, Findings]) -> list[Windo
     """
     if len(chains.each) > 1 or not chains.policy.calibrated:
         return []
+    open_ = [b for b in STAGES if findings[b].base.residuals and not passes_as_noise(findings[b].final, MATERIAL)]
+    if not open_:
+        return []
     every = hypotheses(chains.model, chains.further, chains.left_out, mismatches=False)
-    for stage in STAGES:
-        f = findings[stage]
-        if not f.base.residuals or passes_as_noise(f.final, MATERIAL):
-            continue
-        changed = stages_of(chains, every)
-        mine = [h for h in every if changed[h.name][:1] == (stage,)]
-        return _best_windows(chains, stage, f, mine)
-    return []
+    changed = stages_of(chains, every)
+    each = (_best_windows(chains, b, findings[b], [h for h in every if changed[h.name][:1] == (b,)]) for b in open_)
+    return next((windows for windows in each if windows), [])
 
 
 def with_window(chains: CutChains, window: Window) -> CutChains:
