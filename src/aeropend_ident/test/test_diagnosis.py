@@ -279,10 +279,10 @@ def test_effects_with_which_the_run_diverges_are_taken_out(monkeypatch):
 
 
 @pytest.mark.promise("Verdict", "Small imperfections beside an effect do not make it one with more parameters")
-@pytest.mark.parametrize(("small", "left", "name"), [
+@pytest.mark.parametrize(("small", "rms", "name"), [
     ("ab", 0.2, "simple"), ("a", 0.2, "complex"), ("ab", 0.3, "complex")])
 def test_of_effects_that_close_as_much_the_simplest_is_taken_if_there_are_small_ones_beside_it(
-        monkeypatch, small, left, name):
+        monkeypatch, small, rms, name):
     def found(name, rms):
         stages = {"arm": SimpleNamespace(name=name)}
         return Measured(SimpleNamespace(chains=None, stages=stages), None, left_gaps(rms),
@@ -290,8 +290,8 @@ def test_of_effects_that_close_as_much_the_simplest_is_taken_if_there_are_small_
 
     monkeypatch.setattr(diagnosis, "replace", lambda found, stages: stages["arm"].name)
     monkeypatch.setattr(diagnosis, "with_simpler",
-                        lambda chains, f, claimed: SimpleNamespace(name="simple") if f.name in claimed else f)
-    monkeypatch.setattr(diagnosis, "measured", lambda fitted, name, *_: found(name, left))
+                        lambda chains, f, large: SimpleNamespace(name="simple") if f.name in large else f)
+    monkeypatch.setattr(diagnosis, "measured", lambda fitted, name, *_: found(name, rms))
     taken = diagnosis._among_imperfections(None, found("complex", 0.19), Settings(), None)
     assert taken.found.stages["arm"].name == name
 

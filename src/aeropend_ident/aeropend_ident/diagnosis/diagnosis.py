@@ -276,10 +276,10 @@ def _among_imperfections(fitted: CutChains, now: Measured, settings: Settings, p
     The further parameters of an effect then describe some of these, with much evidence and for little of the gap.
     """
     share = gap_share.shares(now.parts)
-    claimed = {p.name for p in now.parts if p.name in share and share[p.name].value >= settings.material}
-    if sum(p.name in share and p.name not in claimed for p in now.parts) < SEVERAL:
+    large = {name for name, s in share.items() if s.value >= settings.material}
+    if len(share.keys() - large) < SEVERAL:
         return now
-    stages = {b: with_simpler(now.found.chains, f, claimed) for b, f in now.found.stages.items()}
+    stages = {b: with_simpler(now.found.chains, f, large) for b, f in now.found.stages.items()}
     if all(f is now.found.stages[b] for b, f in stages.items()):
         return now
     simpler = measured(fitted, replace(now.found, stages=stages), settings, progress)

@@ -83,12 +83,13 @@ def with_simpler(chains: CutChains, findings: Findings, imperfect: Collection[st
     before = findings.base
     for selection in findings.found:
         first, *rest = selection
-        other = first.hypothesis.name in imperfect
-        shows = other or mean_square(first.fit, findings.stage) >= FORM_SHOWS
+        no_evidence = first.hypothesis.name in imperfect
+        shows = no_evidence or mean_square(first.fit, findings.stage) >= FORM_SHOWS
         simpler = [r for r in rest if len(r.hypothesis.own) < len(first.hypothesis.own)
                    and (shows or r.probability > CALIBRATED.undecided)]
         least, alike = _alike(chains, findings, before, first, simpler)
-        alike = [r for r in alike if other or r.ranked.probability > CALIBRATED.undecided or r.more < least]
+        alike = [r for r in alike
+                 if no_evidence or r.ranked.probability > CALIBRATED.undecided or r.more < least]
         before = first.fit
         if alike:
             best = min(alike, key=lambda r: len(r.ranked.hypothesis.own))

@@ -272,9 +272,7 @@ class SelectionRound:
         by_evidence, gains = gains, frugal(self.chains, self.stage, tried, gains)
         behind = {h.name for (h, _), g, now, closes in zip(tried, by_evidence, gains, first, strict=True)
                   if now < g or not closes}
-        weights = np.where([*first, none], [*gains, 0.0], -np.inf)
-        weights = np.exp(weights - weights.max())
-        probability = weights / weights.sum()
+        probability = softmax(np.where([*first, none], [*gains, 0.0], -np.inf))
         ranked = [RankedHypothesis(h, f, g, float(p)) for (h, f), g, p in zip(tried, gains, probability, strict=False)]
         order = sorted(range(len(tried)), key=lambda j: (not first[j], -gains[j]))
         return tuple(self._ranked_by_place(by_family([ranked[j] for j in order]), behind))

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import softmax
 
 from aeropend_ident.diagnosis.chain.chain import CutChains
 from aeropend_ident.diagnosis.chain.values import CHANNELS_OF, neutral
@@ -414,10 +415,9 @@ def _likely_sets(linear: LinearStage, swaps: Sequence[_Swap]) -> tuple[LikelySet
     for there, families in fitted:
         if there > found.get(frozenset(families), (-np.inf,))[0]:
             found[frozenset(families)] = there, families
-    log_evidence = np.array([e for e, _ in found.values()])
-    weights = np.exp(log_evidence - log_evidence.max())
-    likely = [LikelySet(families, float(p)) for (_, families), p in zip(found.values(), weights / weights.sum(),
-                                                                       strict=True) if p > CALIBRATED.undecided]
+    probability = softmax([e for e, _ in found.values()])
+    likely = [LikelySet(families, float(p)) for (_, families), p in zip(found.values(), probability, strict=True)
+              if p > CALIBRATED.undecided]
     return tuple(sorted(likely, key=lambda s: -s.probability))
 
 
