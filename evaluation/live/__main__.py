@@ -14,13 +14,11 @@ import pickle
 import sys
 import time
 import tracemalloc
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 from threadpoolctl import threadpool_limits
 
 from aeropend_ident.live import false_alarms
@@ -28,6 +26,7 @@ from aeropend_ident.live.companion_model import Samples
 from aeropend_ident.live.intake import Batch
 from aeropend_ident.live.watcher import Watcher
 from aeropend_sim.model.parameters import load
+from evaluation.blind.folder import each
 from evaluation.blind.plant import PERIOD
 from evaluation.blind.score import wilson
 from evaluation.live import rigs
@@ -105,29 +104,38 @@ def watched(samples: Samples, since: float, watcher: Watcher | None = None) -> T
                 max(places, key=lambda p: places[p]), best.hypothesis, levels, load_)
 
 
-def cases(count: int, seed: int, keep: Path | None, kind: str) -> Iterable[rigs.Case]:
-    """The recordings in which an effect begins, drawn in turn over effects and controllers; kept ones are read.
+def case_of(k: int, seed: int, keep: Path | None, kind: str) -> rigs.Case:
+    """The k-th recording in which an effect begins, in turn over effects and controllers; a kept one is read.
 
     Args:
-        count: of the recordings.
+        k: number of the recording.
         seed: of the first one.
         keep: folder that keeps them.
         kind: of `KINDS`.
     """
     names = rigs.LOOPS if kind == "resting" else rigs.CONTROLLERS
-    for k in range(count):
-        rep, i = divmod(k, len(rigs.BEGINNING))
-        name = names[(rep * 5 + i * 3 + seed) % len(names)]
-        number = seed + 100 * rep + i
-        kept = keep / f"{kind}-{number}.pkl" if keep else None
-        if kept and kept.exists():
-            yield pickle.loads(kept.read_bytes())
-            continue
-        case = rigs.draw(rigs.BEGINNING[i], name, number, imperfect=kind == "messy",
-                         holds=rigs.RESTS if kind == "resting" else rigs.HOLDS)
-        if kept:
-            kept.write_bytes(pickle.dumps(case))
-        yield case
+    rep, i = divmod(k, len(rigs.BEGINNING))
+    name = names[(rep * 5 + i * 3 + seed) % len(names)]
+    number = seed + 100 * rep + i
+    kept = keep / f"{kind}-{number}.pkl" if keep else None
+    if kept and kept.exists():
+        return pickle.loads(kept.read_bytes())  # type: ignore[no-any-return]
+    case = rigs.draw(rigs.BEGINNING[i], name, number, imperfect=kind == "messy",
+                     holds=rigs.RESTS if kind == "resting" else rigs.HOLDS)
+    if kept:
+        kept.write_bytes(pickle.dumps(case))
+    return case
+
+
+def changes(kind: str, count: int, seed: int, keep: Path | None, jobs: int) -> list[tuple[rigs.Case, Told]]:
+    """Recordings in which an effect begins, without their samples, and what was told of each."""
+
+    def one(_: int, k: int) -> tuple[rigs.Case, Told]:
+        with threadpool_limits(1):
+            case = case_of(k, seed, keep, kind)
+            return replace(case, samples=Samples(*([np.zeros(0)] * 5))), watched(case.samples, case.since)
+
+    return each(kind, range(count), one, jobs)
 
 
 def share(hits: int, of: int) -> str:
@@ -162,20 +170,19 @@ def detection(all_: Sequence[tuple[rigs.Case, Told]]) -> list[tuple[str, str, st
     ]
 
 
-def quiet_hours(hours: float, seed: int, *, messy: bool) -> tuple[int, float, list[float]]:
+def quiet_hours(hours: float, seed: int, jobs: int, *, messy: bool) -> tuple[int, float, list[float]]:
     """False alarms, hours, and the largest evidence of each ten seconds, over all controllers."""
     names = rigs.CONTROLLERS
     length = 600.0 if messy else 1800.0
-    alarms, total, levels = 0, 0.0, []
-    for k in track(range(max(round(hours * 3600.0 / length), 1)), "messy" if messy else "nominal",
-                   console=Console(stderr=True)):
-        name = names[k % len(names)]
-        made = rigs.messy(name, seed + k, length) if messy else rigs.quiet(name, seed + k, length, off=0.05)
-        told = watched(made, math.inf)
-        alarms += told.delay == -math.inf
-        total += length / 3600.0
-        levels += told.levels
-    return alarms, total, levels
+
+    def one(_: int, k: int) -> Told:
+        with threadpool_limits(1):
+            name = names[k % len(names)]
+            return watched(rigs.messy(name, seed + k, length) if messy
+                           else rigs.quiet(name, seed + k, length, off=0.05), math.inf)
+
+    told = each("messy hours" if messy else "hours", range(max(round(hours * 3600.0 / length), 1)), one, jobs)
+    return sum(t.delay == -math.inf for t in told), len(told) * length / 3600.0, [x for t in told for x in t.levels]
 
 
 def growth(hours: float) -> float:
@@ -201,6 +208,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--hours", type=float, default=24.0, help="hours of nominal rigs without a change")
     parser.add_argument("--messy-hours", type=float, default=4.0, help="hours of messy rigs without a change")
     parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--keep", type=Path, help="folder that keeps the recordings")
     parser.add_argument("--each", action="store_true", help="print each recording")
     parser.add_argument("--docs", action="store_true", help=f"write the table into {PAGE.name}")
@@ -210,11 +218,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with threadpool_limits(1):
         rows: list[tuple[str, str, str, str]] = []
         for k, (kind, count) in enumerate(zip(KINDS, (options.count, options.messy, options.resting), strict=True)):
-            all_ = []
-            for case in cases(count, options.seed + 10_000 * k, options.keep, kind):
-                all_.append((case, watched(case.samples, case.since)))
-                if options.each:
-                    c, t = all_[-1]
+            all_ = changes(kind, count, options.seed + 10_000 * k, options.keep, options.jobs)
+            if options.each:
+                for c, t in all_:
                     print(f"{kind} {c.name}: {c.shown:.1f} floors, after {t.delay:.2f} s, instant {t.onset:+.2f} s, "
                           f"{t.place}, {t.effect}", flush=True)
             if all_:
@@ -223,7 +229,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                              f"{100 * np.median([t.load for _, t in all_]):.1f} % of a core"))
         for kind, hours, imperfect in (("nominal", options.hours, False), ("messy", options.messy_hours, True)):
             if hours > 0.0:
-                alarms, total, levels = quiet_hours(hours, options.seed + 100_000, messy=imperfect)
+                alarms, total, levels = quiet_hours(hours, options.seed + 100_000, options.jobs, messy=imperfect)
                 rows.append((kind, "false alarms", "1 in 24 h", f"{alarms} in {total:.1f} h"))
                 rows.append((kind, "largest evidence without a change", "-", f"{max(levels, default=0.0):.1f}"))
         if options.hours > 0.0:
