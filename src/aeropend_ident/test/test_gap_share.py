@@ -2,6 +2,7 @@
 """The verdict goes by the parts of the gap."""
 
 from dataclasses import replace
+from itertools import combinations
 from types import SimpleNamespace
 
 import numpy as np
@@ -94,15 +95,43 @@ def effect(name, parameter=""):
     return SimpleNamespace(name=name, place="arm", parameter=parameter, own=[SimpleNamespace(name=f"{name}.size")])
 
 
-def test_one_of_two_effects_that_stand_in_for_each_other_is_unique():
-    a, b, c = effect("a"), effect("b"), effect("c")
+def stand_ins():
+    """Effects a and b, each of which could close what the other does; and c, which no other imitates."""
     fixed = {"": 0.1, "a": 0.5, "b": 0.7, "c": 0.2, "bc": 0.9, "ac": 0.6, "ab": 0.8, "abc": 1.0}
-    parts = Fitted([[a, b, c]], fixed, {"a": 0.11, "b": 0.12, "c": 0.2, "ab": 0.6}).parts()
+    return Fitted([[effect("a"), effect("b"), effect("c")]], fixed, {"a": 0.11, "b": 0.12, "c": 0.2, "ab": 0.6})
+
+
+def test_beside_small_imperfections_one_of_two_effects_that_stand_in_for_each_other_is_unique(monkeypatch):
+    monkeypatch.setattr(gap_share, "SEVERAL", 0)
+    parts = stand_ins().parts()
     assert [parts[n].unique for n in "abc"] == pytest.approx([0.01, 0.49, 0.1])
     assert [parts[n].instead_of for n in "abc"] == ["b", "", ""]
     head = headline(list(parts.values()), shares(list(parts.values())), 0.03)
     assert set(head.effects) == {"b", "c"}
     assert head.small == ["a"]
+
+
+def test_without_small_imperfections_the_evidence_tells_effects_apart_that_stand_in_for_each_other():
+    fitted = stand_ins()
+    parts = list(fitted.parts().values())
+    assert not any(p.instead_of for p in parts)
+    assert set(headline(parts, shares(parts), 0.03).effects) == {"a", "b", "c"}
+    fitted.again["a"] = 0.09  # less is left without it
+    parts = list(fitted.parts().values())
+    assert headline(parts, shares(parts), 0.03).small == ["a"]
+    fitted.chains.policy.calibrated = False
+    parts = list(fitted.parts().values())
+    assert headline(parts, shares(parts), 0.03).small == ["a"]
+
+
+@pytest.mark.parametrize(("small", "claimed"), [("", {"a", "b"}), ("c", {"a", "b"}), ("cd", {"b"})])
+def test_small_imperfections_are_several_effects_of_less_than_a_material_share(small, claimed):
+    names = "ab" + small
+    gone = ["".join(c) for n in range(len(names) + 1) for c in combinations(names, n)]
+    fixed = {g: 0.1 + sum(0.4 if n in "ab" else 0.002 for n in g) for g in gone}
+    again = {"a": 0.11, "b": 0.12, "ab": 0.6, "c": 0.1, "d": 0.1}
+    parts = list(Fitted([[effect(n) for n in names]], fixed, again).parts().values())
+    assert set(headline(parts, shares(parts), 0.03).effects) == claimed
 
 
 def test_a_parameter_that_is_off_stands_in_for_an_effect_and_not_the_effect_for_it():

@@ -75,9 +75,6 @@ NOT_LEARNED = "the missing term was not learned, to bound the time: with more --
 CHANGED = 1.5
 """RMS early in the held-out part over that in the fitted part above which the rig changes there (choice)."""
 
-SEVERAL = 2
-"""Effects of less than a material share from which a rig has small imperfections (choice: more than one by chance)."""
-
 FURTHEST = 0.9
 """Share of such a recording that is fitted (choice: two thirds of what is usually held out)."""
 
@@ -277,7 +274,7 @@ def _among_imperfections(fitted: CutChains, now: Measured, settings: Settings, p
     """
     share = gap_share.shares(now.parts)
     large = {name for name, s in share.items() if s.value >= settings.material}
-    if len(share.keys() - large) < SEVERAL:
+    if len(share.keys() - large) < gap_share.SEVERAL:
         return now
     stages = {b: with_simpler(now.found.chains, f, large) for b, f in now.found.stages.items()}
     if all(f is now.found.stages[b] for b, f in stages.items()):

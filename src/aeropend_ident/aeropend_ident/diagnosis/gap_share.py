@@ -44,6 +44,9 @@ SURELY = 1.0 / 3.0
 
 Choice: its best estimate is material, and it is surely there."""
 
+SEVERAL = 2
+"""Effects of less than a material share from which a rig has small imperfections (choice: more than one by chance)."""
+
 MOSTLY_OPEN = 0.5
 """Share of the gap above which what the effects found leave is the verdict (derived: it is more than all of them)."""
 
@@ -59,7 +62,8 @@ class Part:
         windows: (W,) the same over each window of the bootstrap.
         unsure: relative standard deviation of the size of the effect, its other parameters held.
         ends: least and most that it may be, as effects stand in for each other.
-        unique: what comes back without it although the other effects are fitted again: no other effect closes that.
+        unique: what comes back without it although the other effects are fitted again: no other effect closes that;
+            inf where that is not asked.
         instead_of: name of an effect that it stands in for: either of the two closes what both do; "": of none.
     """
 
@@ -105,6 +109,9 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, before: Gap, material: 
     sizes are hardly determined one by one, and the other effects are fitted again for both values.
 
     The nominal model is one without effects. So without all of them no more is open than it leaves.
+
+    In a calibrated rig without small imperfections the evidence tells effects apart that close the same of the gap. No
+    unique part is asked of them.
 
     Args:
         joint: the joint fit.
@@ -153,11 +160,15 @@ def parts_of_effects(joint: JointFit, held_out: HeldOut, before: Gap, material: 
     parts = [p for effects in stages for p in _adding_up(
         [part(h, effects) for h in effects], squared(gap(effects)) - squared(after))]
     least = material * (squared(gap(every)) - after.total_floor(held_out.floors()) ** 2)
-    return _without_stand_ins(parts, {h.name: h for h in every}, joint, held_out, least, jobs)
+    named = {h.name: h for h in every}
+    told = joint.chains.policy.calibrated and sum(p.amount < least for p in parts) < SEVERAL
+    parts = _without_stand_ins(parts, named, joint, held_out, least, jobs, parameters_alone=told)
+    return [replace(p, unique=math.inf) if told and 0.0 <= p.unique < least and not named[p.name].parameter else p
+            for p in parts]
 
 
 def _without_stand_ins(parts: Sequence[Part], effects: Mapping[str, Hypothesis], joint: JointFit, held_out: HeldOut,
-                       least: float, jobs: int) -> list[Part]:
+                       least: float, jobs: int, *, parameters_alone: bool) -> list[Part]:
     """What is unique to each part once effects that stand in for others are left out.
 
     Of two effects that stand in for each other neither is unique. A parameter that is off is left out before an effect,
@@ -171,11 +182,12 @@ def _without_stand_ins(parts: Sequence[Part], effects: Mapping[str, Hypothesis],
         held_out: measures gaps.
         least: amount that is material.
         jobs: processes.
+        parameters_alone: whether only parameters that are off are left out.
     """
     judged, left_out = {p.name: p for p in parts}, list[Hypothesis]()
     while True:
         open_ = [p for p in judged.values() if p.amount >= least > p.unique and effects[p.name] not in left_out]
-        if len(open_) < 2:
+        if len(open_) < 2 or (parameters_alone and not any(effects[p.name].parameter for p in open_)):
             return list(judged.values())
         out = min(open_, key=lambda p: (not effects[p.name].parameter, p.unique)).name
         left_out.append(effects[out])
