@@ -29,6 +29,13 @@ def test_when_an_effect_begins_or_ends(effect, since, until):
     assert abs(at.value - true) < 0.5
 
 
+def test_a_delay_begins_between_two_steps_of_the_duty():
+    found = diagnose(BENCH, [changing(31, {"command_delay": {}}, 9.4)]).conclusions.which
+    assert found.effects == ("command_delay",)
+    (at,) = (c.since for c in found.candidates if c.found)
+    assert at.low <= 9.4 <= at.high < at.low + 2.0
+
+
 @pytest.mark.parametrize("begins", [True, False])
 def test_an_instant_stays_away_from_the_ends_of_what_is_fitted(begins):
     """Where each instant fits alike, the search goes to the end of its range."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aeropend_ident.diagnosis.chain.chain import DELAY, CutChains
+from aeropend_ident.diagnosis.chain.chain import DELAY, CutChain, CutChains
 from aeropend_ident.diagnosis.chain.known import Known
 from aeropend_ident.diagnosis.chain.priors import (
     CHOSEN,
@@ -274,17 +274,17 @@ def stages_of(chains: CutChains, tried: Sequence[Hypothesis]) -> dict[str, tuple
     return out
 
 
-def delay_from_voltage(chains: CutChains, hypothesis: Hypothesis, values: Mapping[str, float]) -> Hypothesis:
+def delay_from_voltage(chain: CutChain, hypothesis: Hypothesis, values: Mapping[str, float]) -> Hypothesis:
     """The command delay with its start where the voltage places it: no gradient leads there, as readings jump with it.
 
     Args:
-        chains: cut.
+        chain: of a recording.
         hypothesis: any; others than `command_delay` are returned as they are.
         values: of the actuator without a delay.
     """
-    if hypothesis.effect != "command_delay" or not chains.each[0].signals.has("v_a"):
+    if hypothesis.effect != "command_delay" or not chain.signals.has("v_a"):
         return hypothesis
-    start = chains.each[0].likeliest_delay(chains.values_of(values, 0))
+    start = chain.likeliest_delay(values)
     own = hypothesis.own[0]
     assert own.name == DELAY
     return replace(hypothesis, starts=((replace(own, mean=start, start=start),),))

@@ -22,7 +22,13 @@ from aeropend_ident.diagnosis.document import Interval
 from aeropend_ident.diagnosis.policy import MATERIAL
 from aeropend_ident.diagnosis.search.findings import Findings, adopted
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
-from aeropend_ident.diagnosis.search.hypotheses import EFFECT_ODDS, Hypothesis, hypotheses, stages_of
+from aeropend_ident.diagnosis.search.hypotheses import (
+    EFFECT_ODDS,
+    Hypothesis,
+    delay_from_voltage,
+    hypotheses,
+    stages_of,
+)
 from aeropend_ident.diagnosis.search.search import passes_as_noise
 from aeropend_ident.diagnosis.search.selection import CLOSE_GAIN, FORM_SHOWS, squared_gap
 from aeropend_ident.estimation.levenberg_marquardt import Search
@@ -196,15 +202,15 @@ def located(chains: CutChains, findings: Mapping[str, Findings]) -> Onset:
         chains: of one recording, cut with a window.
         findings: of the search with this window.
     """
-    window, inside = _located(chains.each[0], {b: f.final for b, f in findings.items() if f.found})
+    window, (low, high) = _located(chains.each[0], {b: f.final for b, f in findings.items() if f.found})
     period = chains.each[0].signals.period
     begins = window[0] > 0
-    at = Interval(window[not begins] * period, (min(inside) - 1) * period, (max(inside) + 1) * period)
+    at = Interval(window[not begins] * period, low * period, high * period)
     return Onset(window, at if begins else None, None if begins else at)
 
 
-def _located(chain: CutChain, fits: Mapping[str, Fit]) -> tuple[Window, list[int]]:
-    """The window whose instant fits best, and the instants within its 95 % interval."""
+def _located(chain: CutChain, fits: Mapping[str, Fit]) -> tuple[Window, tuple[int, int]]:
+    """The window whose instant fits best, and the ends of its 95 % interval: the nearest that were tried outside."""
     window = chain.signals.window
     assert window is not None
     begins = window[0] > 0
@@ -227,7 +233,10 @@ def _located(chain: CutChain, fits: Mapping[str, Fit]) -> tuple[Window, list[int
         if step == 1:
             break
         reach = 2 * step
-    return _moved(window, best, begins=begins), [k for k, c in costs.items() if c < costs[best] + WITHIN]
+    inside = [k for k, c in costs.items() if c < costs[best] + WITHIN]
+    low = max((k for k in costs if k < min(inside)), default=min(inside))
+    high = min((k for k in costs if k > max(inside)), default=max(inside))
+    return _moved(window, best, begins=begins), (low, high)
 
 
 def _windowed(chain: CutChain, window: Window) -> CutChain:
@@ -275,7 +284,7 @@ def _best_windows(chains: CutChains, stage: str, f: Findings, candidates: Sequen
 
         return explained(total - before), explained(before)
 
-    found: list[tuple[float, Window, tuple[Parameter, ...]]] = []
+    found: list[tuple[float, Window, Hypothesis]] = []
     for h in candidates:
         for own in h.starts:
             moved = residuals({**f.base.values, **{p.name: p.begin for p in own}})
@@ -286,9 +295,9 @@ def _best_windows(chains: CutChains, stage: str, f: Findings, candidates: Sequen
             for gain, begins in ((since, True), (until, False)):
                 k = int(np.argmax(gain))
                 window = (int(instants[k]), len(signals)) if begins else (0, int(instants[k]))
-                found.append((float(gain[k]), window, own))
+                found.append((float(gain[k]), window, replace(h, starts=(own,))))
     found.sort(key=lambda one: -one[0])
-    tried = [_fitted(chain, stage, f.base, known, window, own) for _, window, own in found[:FOLLOWED]]
+    tried = [_fitted(chain, stage, f.base, known, window, h) for _, window, h in found[:FOLLOWED]]
     open_ = (1.0 - CLOSES) * (f.final.mean_square - 1.0)
     likely = sorted(((one.log_likelihood, window) for one, window in tried
                      if one.mean_square - 1.0 < open_), reverse=True)
@@ -302,12 +311,15 @@ def _best_windows(chains: CutChains, stage: str, f: Findings, candidates: Sequen
 
 
 def _fitted(chain: CutChain, stage: str, base: Fit, known: Sequence[Parameter], window: Window,
-            own: Sequence[Parameter]) -> tuple[Fit, Window]:
-    """Fit an effect that acts within a window, and move the window."""
+            effect: Hypothesis) -> tuple[Fit, Window]:
+    """Fit an effect that acts within a window, from the first of its starts, and move the window."""
     f = base
     for _ in range(PASSES):
-        f = fit(_windowed(chain, window).residuals(stage), started([*known, *own], {**f.values}), ROUNDS)
-        window, _ = _located(_windowed(chain, window), {stage: f})
+        within = _windowed(chain, window)
+        begun = replace(effect, starts=(tuple(started(effect.starts[0], f.values)),))
+        own = delay_from_voltage(within, begun, f.values).starts[0]
+        f = fit(within.residuals(stage), [*started(known, f.values), *own], ROUNDS)
+        window, _ = _located(within, {stage: f})
     return f, window
 
 
