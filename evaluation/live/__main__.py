@@ -21,10 +21,13 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from aeropend_ident.diagnosis.diagnosis import diagnose
 from aeropend_ident.live import false_alarms
 from aeropend_ident.live.companion_model import Samples
 from aeropend_ident.live.intake import Batch
+from aeropend_ident.live.ring import AFTER_S, BEFORE_S
 from aeropend_ident.live.watcher import Watcher
+from aeropend_ident.signals.signals import from_arrays
 from aeropend_sim.model.parameters import load
 from evaluation.blind.folder import each
 from evaluation.blind.plant import PERIOD
@@ -59,6 +62,7 @@ class Told:
         effect: told, the most probable at the end.
         levels: largest evidence of each ten seconds without a change.
         load: CPU time over rig time.
+        diagnosed: verdict of `diagnose` on the bag of the alarm; "": not asked.
     """
 
     delay: float
@@ -68,6 +72,7 @@ class Told:
     effect: str
     levels: list[float]
     load: float
+    diagnosed: str = ""
 
 
 def watched(samples: Samples, since: float, watcher: Watcher | None = None) -> Told:
@@ -127,13 +132,34 @@ def case_of(k: int, seed: int, keep: Path | None, kind: str) -> rigs.Case:
     return case
 
 
-def changes(kind: str, count: int, seed: int, keep: Path | None, jobs: int) -> list[tuple[rigs.Case, Told]]:
-    """Recordings in which an effect begins, without their samples, and what was told of each."""
+def diagnosed(samples: Samples, alarm: float) -> str:
+    """Verdict of `diagnose` on the bag that `watch` writes at an alarm [s], as far as the recording goes."""
+    model = load("bench")
+    part = slice(max(round((alarm - BEFORE_S) / PERIOD), 0), round((alarm + AFTER_S) / PERIOD))
+    signals = from_arrays({name: x[part] for name, x in samples._asdict().items()}, PERIOD, model.sensing)
+    return diagnose(model, [signals], 1).conclusions.which.verdict
+
+
+def changes(kind: str, count: int, seed: int, keep: Path | None, jobs: int, *, ask: bool
+            ) -> list[tuple[rigs.Case, Told]]:
+    """Recordings in which an effect begins, without their samples, and what was told of each.
+
+    Args:
+        kind: of `KINDS`.
+        count: of the recordings.
+        seed: of the first one.
+        keep: folder that keeps them.
+        jobs: processes.
+        ask: whether to diagnose the bag of each alarm.
+    """
 
     def one(_: int, k: int) -> tuple[rigs.Case, Told]:
         with threadpool_limits(1):
             case = case_of(k, seed, keep, kind)
-            return replace(case, samples=Samples(*([np.zeros(0)] * 5))), watched(case.samples, case.since)
+            told = watched(case.samples, case.since)
+            if ask and 0.0 < told.delay < math.inf:
+                told = replace(told, diagnosed=diagnosed(case.samples, case.since + told.delay))
+            return replace(case, samples=Samples(*([np.zeros(0)] * 5))), told
 
     return each(kind, range(count), one, jobs)
 
@@ -164,14 +190,25 @@ def detection(all_: Sequence[tuple[rigs.Case, Told]]) -> list[tuple[str, str, st
         ("instant, median error", "0.5 s", f"{np.median([abs(t.onset) for _, t in found]):.2f} s"),
         ("right place", "95 %", share(sum(t.place == c.place for c, t in found), len(found))),
         ("right effect", "90 %", share(sum(t.effect == c.effect for c, t in found), len(found))),
+        *([("right effect, by `diagnose` of the bag", "90 %",
+            share(sum(t.diagnosed == c.effect for c, t in found), len(found)))] if any(t.diagnosed for _, t in found)
+          else []),
         ("of effects that make less than 2 floors in the loop: alarm", "-",
          share(sum(math.isfinite(t.delay) for c, t in all_ if c.shown < rigs.FLOORS[0]),
                sum(c.shown < rigs.FLOORS[0] for c, _ in all_))),
     ]
 
 
-def quiet_hours(hours: float, seed: int, jobs: int, *, messy: bool) -> tuple[int, float, list[float]]:
-    """False alarms, hours, and the largest evidence of each ten seconds, over all controllers."""
+def quiet_hours(hours: float, seed: int, jobs: int, *, messy: bool, show: bool) -> tuple[int, float, list[float]]:
+    """False alarms, hours, and the largest evidence of each ten seconds, over all controllers.
+
+    Args:
+        hours: without a change.
+        seed: of the first recording.
+        jobs: processes.
+        messy: whether the rigs have many small imperfections.
+        show: whether to print each recording.
+    """
     names = rigs.CONTROLLERS
     length = 600.0 if messy else 1800.0
 
@@ -182,6 +219,9 @@ def quiet_hours(hours: float, seed: int, jobs: int, *, messy: bool) -> tuple[int
                            else rigs.quiet(name, seed + k, length, off=0.05), math.inf)
 
     told = each("messy hours" if messy else "hours", range(max(round(hours * 3600.0 / length), 1)), one, jobs)
+    for k, t in enumerate(told if show else ()):
+        print(f"{'messy ' * messy}hours, {names[k % len(names)]}-{seed + k}: largest evidence "
+              f"{max(t.levels, default=0.0):.1f}, {t.effect or 'no alarm'}", flush=True)
     return sum(t.delay == -math.inf for t in told), len(told) * length / 3600.0, [x for t in told for x in t.levels]
 
 
@@ -210,6 +250,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--keep", type=Path, help="folder that keeps the recordings")
+    parser.add_argument("--diagnose", action="store_true", help="diagnose the bag of each alarm, too")
     parser.add_argument("--each", action="store_true", help="print each recording")
     parser.add_argument("--docs", action="store_true", help=f"write the table into {PAGE.name}")
     options = parser.parse_args(arguments)
@@ -218,18 +259,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with threadpool_limits(1):
         rows: list[tuple[str, str, str, str]] = []
         for k, (kind, count) in enumerate(zip(KINDS, (options.count, options.messy, options.resting), strict=True)):
-            all_ = changes(kind, count, options.seed + 10_000 * k, options.keep, options.jobs)
+            all_ = changes(kind, count, options.seed + 10_000 * k, options.keep, options.jobs,
+                           ask=options.diagnose)
             if options.each:
                 for c, t in all_:
                     print(f"{kind} {c.name}: {c.shown:.1f} floors, after {t.delay:.2f} s, instant {t.onset:+.2f} s, "
-                          f"{t.place}, {t.effect}", flush=True)
+                          f"{t.place}, {t.effect}{', ' * bool(t.diagnosed)}{t.diagnosed}", flush=True)
             if all_:
                 rows += [(kind, *row) for row in detection(all_)]
                 rows.append((kind, "CPU of detector and model", "-",
                              f"{100 * np.median([t.load for _, t in all_]):.1f} % of a core"))
         for kind, hours, imperfect in (("nominal", options.hours, False), ("messy", options.messy_hours, True)):
             if hours > 0.0:
-                alarms, total, levels = quiet_hours(hours, options.seed + 100_000, options.jobs, messy=imperfect)
+                alarms, total, levels = quiet_hours(hours, options.seed + 100_000, options.jobs, messy=imperfect,
+                                                    show=options.each)
                 rows.append((kind, "false alarms", "1 in 24 h", f"{alarms} in {total:.1f} h"))
                 rows.append((kind, "largest evidence without a change", "-", f"{max(levels, default=0.0):.1f}"))
         if options.hours > 0.0:

@@ -49,10 +49,15 @@ Choice: the columns are those of effects that have long been there; observer and
 GROWTH = 1.25
 """Ratio of the ages of two instants that are tried (choice: a likelihood ratio loses a tenth in between at most)."""
 
-DRIFT = 600.0
-"""[s] Time constant with which sizes wander within what a rig may have.
+WARMS, WARMING = ("actuator", "electrical"), 600.0
+"""Places whose sizes wander within what a rig may have, and [s] the time constant.
 
 Choice: windings warm up and batteries drain in minutes, not in seconds."""
+
+WEARING = 86_400.0
+"""[s] Time constant of all other sizes (choice: wear takes days; a screw that gets loose is a change).
+
+Ten minutes for all sizes were too short: an effect of the arm of 5 floors passed for what a rig may have."""
 
 BLOCK = 2.0
 """[s] Length of the blocks over which the variance of sums is measured.
@@ -163,7 +168,7 @@ class _Stage:
         self.columns = list(columns)
         d = len(self.columns)
         self.scale = np.array([c.sd / c.step for c in self.columns])
-        self.keep = math.exp(-tick / DRIFT)
+        self.keep = np.exp([-tick / (WARMING if c.place in WARMS else WEARING) for c in self.columns])
         self.x, self.p = np.zeros(d), np.eye(d)
         self.products, self.cross, self.squares, self.rows = np.zeros((d, d)), np.zeros(d), np.zeros((d, d)), 0.0
         self.snapshots: deque[_Snapshot] = deque(maxlen=round(WINDOW / tick) + 1)
@@ -179,7 +184,7 @@ class _Stage:
         wj = j * weight[:, None]
         n, y = wj.T @ j, wj.T @ r
         d = len(self.x)
-        p = self.keep**2 * self.p + (1.0 - self.keep**2) * np.eye(d)
+        p = np.outer(self.keep, self.keep) * self.p + np.diag(1.0 - self.keep**2)
         x = self.keep * self.x
         p = np.linalg.solve(np.eye(d) + p @ n, p)
         self.p = 0.5 * (p + p.T)
