@@ -93,7 +93,7 @@ def test_a_rig_that_does_not_change_is_no_alarm():
 @pytest.mark.parametrize(("effect", "parameter", "size", "place"), [
     ("bridge_drop", "v_drop", 0.2, "actuator"), ("rotor_friction", "torque", 5e-4, "rotor"),
     ("current_offset", "bias", 0.06, "sensing"), ("coulomb_friction", "accel", 0.8, "arm"),
-    ("coulomb_friction", "accel", 0.2, "arm"), ("ground_effect", "gain", 0.08, "thrust"),
+    ("coulomb_friction", "accel", 0.3, "arm"), ("ground_effect", "gain", 0.08, "thrust"),
     ("angle_offset", "bias", 0.01, "sensing"),
 ])
 def test_an_effect_that_begins_is_told_with_instant_place_and_name(effect, parameter, size, place):

@@ -67,9 +67,6 @@ Choice: what small imperfections leave lasts as long as the arm stays where it i
 REMEMBERED = 300.0
 """[s] Time constant with which the variance of a channel is learned (choice: many references)."""
 
-EXPECTED_GAP, BELIEVED = 0.25, 3
-"""[floors] Lasting gap that is expected of an unknown rig, and the blocks that it counts for (choice)."""
-
 LEARNS = 60.0
 """[s] Time of motion after a start in which the rig is learned and no alarm is given (choice: a dozen references)."""
 
@@ -81,9 +78,9 @@ RAISED = 2.0
 
 Choice: what a rig has shown once without a change it will show again, and perhaps somewhat larger."""
 
-LEAST_GAP = 0.05
-"""[floors] Lasting gap in a channel that is never material (choice: the linearised model of a rig whose numbers are 5 %
-off leaves about so much)."""
+LEAST_GAP = 0.25
+"""[floors] Lasting gap in a channel that is never material (choice: an eighth of the two floors from which an effect is
+to be found; the linearised model of a rig whose numbers are 5 % off leaves a fifth of it, and more after jumps)."""
 
 INEXACT = 0.01
 """Share of the evidence by which two instants may differ and fit as well (choice: the columns are linearised)."""
@@ -229,7 +226,7 @@ class _Variance:
     def __init__(self) -> None:
         self.blocks, self.sum, self.unsure, self.n = 0, 0.0, 0.0, 0
         self.typical = BLOCK / SAMPLE_PERIOD
-        self.value = 1.0 + EXPECTED_GAP**2 * self.typical
+        self.value = 1.0
         self.waiting: deque[tuple[float, float]] = deque()
         self.cusum, self.since = 0.0, 0.0
 
@@ -261,7 +258,7 @@ class _Variance:
             _, z = self.waiting.popleft()
             if learn:
                 self.blocks += 1
-                share = max(BLOCK / REMEMBERED, 1.0 / (self.blocks + BELIEVED))
+                share = max(BLOCK / REMEMBERED, 1.0 / (self.blocks + 1))
                 self.value += share * (min(z, ROBUST * max(self.value, 1.0)) - self.value)
                 self.value = max(self.value, 1.0)
         self.sum, self.unsure, self.n = 0.0, 0.0, 0
