@@ -435,7 +435,7 @@ def test_nothing_tried_is_said(nominal):
     ({"found": True}, ""),
     ({"share": {"value": 0.2, "low": -0.1, "high": 0.4}}, "its share of the squared gap is not surely above 0"),
     ({"share": {"value": 0.01, "low": 0.005, "high": 0.02}},
-     "its share of the squared gap is too small, or too unsure, to be claimed"),
+     "its share of the squared gap is too small or too unsure, or other effects could close it"),
     ({"gap_after": 0.2}, "less evidence than thrust_lag; does not make the gap smaller"),
     ({"gap_after": 0.0122, "behind": "parameter_mismatch:R_a"}, "less evidence than R_a"),
     ({"gap_after": None, "behind": None, "evidence": -3.0}, "no more evidence than without it"),

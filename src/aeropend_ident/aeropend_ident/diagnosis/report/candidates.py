@@ -179,7 +179,7 @@ def why_lost(document: DiagnosisDocument, c: Candidate) -> str:
     if c.share is not None:
         if c.share.low <= 0.0:
             return "its share of the squared gap is not surely above 0"
-        return "its share of the squared gap is too small, or too unsure, to be claimed"
+        return "its share of the squared gap is too small or too unsure, or other effects could close it"
     reasons = [f"{name} is at the end of its range" for name in _at_an_end(c)]
     if c.behind is not None:
         reasons.append(f"less evidence than {c.behind.rpartition(':')[2]}")

@@ -35,7 +35,7 @@ class Verdict:
         lines: the effects found.
         between: the 95 % interval of the closed share, or "".
         besides: place of an unknown effect beside the effects found, or "".
-        small: effects whose share of the gap is too small, or too unsure, to be claimed.
+        small: effects that were found and are not claimed: see `why_lost`.
         unexplained: reasons for the verdict "unknown".
     """
 
