@@ -78,9 +78,9 @@ RAISED = 2.0
 
 Choice: what a rig has shown once without a change it will show again, and perhaps somewhat larger."""
 
-LEAST_GAP = 0.25
-"""[floors] Lasting gap in a channel that is never material (choice: an eighth of the two floors from which an effect is
-to be found; the linearised model of a rig whose numbers are 5 % off leaves a fifth of it, and more after jumps)."""
+LEAST_GAP = 0.2
+"""[floors] Lasting gap in a channel that is never material (choice: a tenth of the two floors from which an effect is
+to be found; the linearised model of a rig whose numbers are 5 % off leaves a quarter of it, and more after jumps)."""
 
 INEXACT = 0.01
 """Share of the evidence by which two instants may differ and fit as well (choice: the columns are linearised)."""
