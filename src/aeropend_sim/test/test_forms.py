@@ -48,6 +48,18 @@ def test_a_form_acts_like_its_effect_but_not_the_same(form):
     assert 0.0 < away(mine, its) < away(its, nominal)
 
 
+@pytest.mark.parametrize("effect", [
+    e for e in DEFINED.values() if e.formula and sum(not p.refines for p in e.parameters.values()) > 1],
+                         ids=lambda e: e.id)
+def test_almost_without_its_size_an_effect_is_almost_absent_whatever_its_other_parameters_are(effect):
+    given = {n: p.neutral if p.refines else 0.7 * p.default + 0.3 * p.high for n, p in effect.parameters.items()}
+    size = effect.parameters[effect.size]
+    given[effect.size] = size.neutral + 1e-6 * (size.default - size.neutral)
+    (mine, _), (nominal, _) = (record(m, DUTY[:1500], seed=3) for m in (defaults(effect.id, **given), BENCH))
+    for channel in ("theta", "omega", "i_a", "v_a"):
+        assert np.nanstd(mine[channel] - nominal[channel]) < 1e-2 * np.nanstd(nominal[channel])
+
+
 def test_a_parameter_is_found_in_any_form():
     assert defaults("coulomb_friction_stribeck", accel=0.7).in_any_form("coulomb_friction", "accel") == 0.7
     assert defaults("coulomb_friction", accel=0.6).in_any_form("coulomb_friction", "accel") == 0.6
