@@ -82,21 +82,22 @@ def watched(samples: Samples, since: float, watcher: Watcher | None = None) -> T
     n = len(samples.theta)
     alarm, levels, highest, block = math.inf, [], -math.inf, 0
     begun = time.process_time()
-    for k in range(0, n - BATCH + 1, BATCH):
-        s = slice(k, k + BATCH)
-        batch = Batch(np.round(np.arange(k, k + BATCH) * PERIOD * 1e9).astype(np.int64),
-                      Samples(*(x[s] for x in samples)), "start" if k == 0 else "")
-        _, found = w.step(batch)
-        if d.learned > 0.0 and d.alarm is None and d.time < since:
-            highest = max(highest, d.statistic)
-            if int(d.time / 10.0) != block:
-                block = int(d.time / 10.0)
-                levels.append(highest)
-                highest = -math.inf
-        if found is not None and math.isinf(alarm):
-            alarm = d.time
-        if alarm < since:
-            break
+    with threadpool_limits(1):
+        for k in range(0, n - BATCH + 1, BATCH):
+            s = slice(k, k + BATCH)
+            batch = Batch(np.round(np.arange(k, k + BATCH) * PERIOD * 1e9).astype(np.int64),
+                          Samples(*(x[s] for x in samples)), "start" if k == 0 else "")
+            _, found = w.step(batch)
+            if d.learned > 0.0 and d.alarm is None and d.time < since:
+                highest = max(highest, d.statistic)
+                if int(d.time / 10.0) != block:
+                    block = int(d.time / 10.0)
+                    levels.append(highest)
+                    highest = -math.inf
+            if found is not None and math.isinf(alarm):
+                alarm = d.time
+            if alarm < since:
+                break
     load_ = (time.process_time() - begun) / max(d.time, 1e-9)
     if w.alarm is None:
         return Told(math.inf, math.nan, False, "", "", levels, load_)
@@ -154,12 +155,11 @@ def changes(kind: str, count: int, seed: int, keep: Path | None, jobs: int, *, a
     """
 
     def one(_: int, k: int) -> tuple[rigs.Case, Told]:
-        with threadpool_limits(1):
-            case = case_of(k, seed, keep, kind)
-            told = watched(case.samples, case.since)
-            if ask and 0.0 < told.delay < math.inf:
-                told = replace(told, diagnosed=diagnosed(case.samples, case.since + told.delay))
-            return replace(case, samples=Samples(*([np.zeros(0)] * 5))), told
+        case = case_of(k, seed, keep, kind)
+        told = watched(case.samples, case.since)
+        if ask and 0.0 < told.delay < math.inf:
+            told = replace(told, diagnosed=diagnosed(case.samples, case.since + told.delay))
+        return replace(case, samples=Samples(*([np.zeros(0)] * 5))), told
 
     return each(kind, range(count), one, jobs)
 
@@ -213,10 +213,9 @@ def quiet_hours(hours: float, seed: int, jobs: int, *, messy: bool, show: bool) 
     length = 600.0 if messy else 1800.0
 
     def one(_: int, k: int) -> Told:
-        with threadpool_limits(1):
-            name = names[k % len(names)]
-            return watched(rigs.messy(name, seed + k, length) if messy
-                           else rigs.quiet(name, seed + k, length, off=0.05), math.inf)
+        name = names[k % len(names)]
+        return watched(rigs.messy(name, seed + k, length) if messy
+                       else rigs.quiet(name, seed + k, length, off=0.05), math.inf)
 
     told = each("messy hours" if messy else "hours", range(max(round(hours * 3600.0 / length), 1)), one, jobs)
     for k, t in enumerate(told if show else ()):
@@ -257,28 +256,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.keep:
         options.keep.mkdir(parents=True, exist_ok=True)
-    with threadpool_limits(1):
-        rows: list[tuple[str, str, str, str]] = []
-        for k, (kind, count) in enumerate(zip(KINDS, (options.count, options.messy, options.resting), strict=True)):
-            all_ = changes(kind, count, options.seed + 10_000 * k, options.keep, options.jobs,
-                           ask=options.diagnose)
-            if options.each:
-                for c, t in all_:
-                    print(f"{kind} {c.name}: {c.shown:.1f} floors, after {t.delay:.2f} s, instant {t.onset:+.2f} s, "
-                          f"{t.place}, {t.effect}{', ' * bool(t.diagnosed)}{t.diagnosed}", flush=True)
-            if all_:
-                rows += [(kind, *row) for row in detection(all_)]
-                rows.append((kind, "CPU of detector and model", "-",
-                             f"{100 * np.median([t.load for _, t in all_]):.1f} % of a core"))
-        for kind, hours, imperfect in (("nominal", options.hours, False), ("messy", options.messy_hours, True)):
-            if hours > 0.0:
-                alarms, total, levels = quiet_hours(hours, options.seed + 100_000, options.jobs, messy=imperfect,
-                                                    show=options.each)
-                rows.append((kind, "false alarms", "1 in 24 h", f"{alarms} in {total:.1f} h"))
-                rows.append((kind, "largest evidence without a change", "-", f"{max(levels, default=0.0):.1f}"))
-        if options.memory_hours > 0.0:
-            rows.append(("nominal", "growth of memory over 24 h of the rig", "5 MiB",
-                         f"{growth(options.memory_hours) * 24.0 / options.memory_hours:.2f} MiB"))
+    rows: list[tuple[str, str, str, str]] = []
+    for k, (kind, count) in enumerate(zip(KINDS, (options.count, options.messy, options.resting), strict=True)):
+        all_ = changes(kind, count, options.seed + 10_000 * k, options.keep, options.jobs, ask=options.diagnose)
+        if options.each:
+            for c, t in all_:
+                print(f"{kind} {c.name}: {c.shown:.1f} floors, after {t.delay:.2f} s, instant {t.onset:+.2f} s, "
+                      f"{t.place}, {t.effect}{', ' * bool(t.diagnosed)}{t.diagnosed}", flush=True)
+        if all_:
+            rows += [(kind, *row) for row in detection(all_)]
+            rows.append((kind, "CPU of detector and model", "-",
+                         f"{100 * np.median([t.load for _, t in all_]):.1f} % of a core"))
+    for kind, hours, imperfect in (("nominal", options.hours, False), ("messy", options.messy_hours, True)):
+        if hours > 0.0:
+            alarms, total, levels = quiet_hours(hours, options.seed + 100_000, options.jobs, messy=imperfect,
+                                                show=options.each)
+            rows.append((kind, "false alarms", "1 in 24 h", f"{alarms} in {total:.1f} h"))
+            rows.append((kind, "largest evidence without a change", "-", f"{max(levels, default=0.0):.1f}"))
+    if options.memory_hours > 0.0:
+        rows.append(("nominal", "growth of memory over 24 h of the rig", "5 MiB",
+                     f"{growth(options.memory_hours) * 24.0 / options.memory_hours:.2f} MiB"))
     table = ["| rigs | figure | target | measured |", "| --- | --- | --- | --- |"]
     table += [f"| {' | '.join(row)} |" for row in rows]
     table += ["", f"Seed {options.seed}; limit {false_alarms.limit(24.0):.1f} for one false alarm in 24 h."]

@@ -18,6 +18,8 @@ from aeropend_sim.model.rig import record
 
 BENCH = load("bench")
 DUTY = np.repeat(np.random.default_rng(3).uniform(0.1, 0.6, 8), 500)
+OF_SEVERAL_PARAMETERS = [e for e in DEFINED.values()
+                         if e.formula and sum(not p.refines for p in e.parameters.values()) > 1]
 
 
 def defaults(id_, **given):
@@ -48,9 +50,7 @@ def test_a_form_acts_like_its_effect_but_not_the_same(form):
     assert 0.0 < away(mine, its) < away(its, nominal)
 
 
-@pytest.mark.parametrize("effect", [
-    e for e in DEFINED.values() if e.formula and sum(not p.refines for p in e.parameters.values()) > 1],
-                         ids=lambda e: e.id)
+@pytest.mark.parametrize("effect", OF_SEVERAL_PARAMETERS, ids=lambda e: e.id)
 def test_almost_without_its_size_an_effect_is_almost_absent_whatever_its_other_parameters_are(effect):
     given = {n: p.neutral if p.refines else 0.7 * p.default + 0.3 * p.high for n, p in effect.parameters.items()}
     size = effect.parameters[effect.size]

@@ -163,7 +163,8 @@ def _search_stage(chains: CutChains, stage: str, candidates: list[Hypothesis],
     findings = Findings(stage, base, base)
     if not base.residuals:
         return findings
-    candidates = [delay_from_voltage(chains.each[0], h, chains.values_of(base.values, 0)) for h in candidates]
+    values = chains.values_of(base.values, 0)
+    candidates = [delay_from_voltage(chains.each[0], h, values) for h in candidates]
     others = {b for h in candidates for b in acts_on[h.family] if b != stage}
     downstream = {b: base_of(b, nominal_parameters(chains, b)) for b in others}
     known, supported, gained = nominal, findings, 0.0
