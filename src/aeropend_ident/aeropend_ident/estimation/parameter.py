@@ -17,6 +17,10 @@ Array = NDArray[np.float64]
 LARGEST_POWER = 709.0
 """Power of e below which it is a number (derived: e^709.8 is the largest one)."""
 
+ROUNDING = 1e-9
+"""Distance from a bound, in units of the prior, that is rounding (derived: far above that of a double, far below any
+change that counts)."""
+
 
 class Key(NamedTuple):
     """The name of a value or of a channel, in its parts.
@@ -93,11 +97,14 @@ class Parameter:
         return (value - self.mean) / self.sd
 
     def value(self, z: float) -> float:
-        """The inverse of `to_standard`."""
+        """The inverse of `to_standard`; at a bound, rounding does not leave the range."""
+        power = self.sd * z
         if not self.log:
-            return float(self.mean + self.sd * z)
-        power = self.sd * z  # an extrapolation may go anywhere before its bounds hold it
-        return float(self.mean * math.exp(power)) if power < LARGEST_POWER else math.inf
+            x, unit = float(self.mean + power), self.sd
+        else:  # an extrapolation may go anywhere before its bounds hold it
+            x = unit = float(self.mean * math.exp(power)) if power < LARGEST_POWER else math.inf
+        held = min(max(x, self.low), self.high)
+        return held if abs(x - held) < ROUNDING * unit else x
 
     def slope(self, z: float) -> float:
         """Derivative of the value with respect to z."""
