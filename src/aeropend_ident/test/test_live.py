@@ -6,6 +6,7 @@ import json
 import math
 import os
 import resource
+import time
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache
@@ -18,6 +19,7 @@ from rosbags.rosbag2 import Reader
 
 from aeropend_ident.commands import live
 from aeropend_ident.live import false_alarms
+from aeropend_ident.live.alarm_diagnosis import AlarmDiagnosis
 from aeropend_ident.live.bank import columns, size_of
 from aeropend_ident.live.companion_model import CHANNELS, Companion, Samples
 from aeropend_ident.live.detector import Finding
@@ -125,10 +127,12 @@ def test_an_alarm_keeps_its_instant_and_its_entry_on_the_page_when_samples_were_
     for away in range(0, 40, 10):
         page.state(watcher, Intake(), 10.0 * away)
         told += json.loads(page._state)["state"]["history"]
+        page.diagnosed(watcher.alarms, "supply_sag")
         fed(watcher, duty[-60 * STEP:], read[:, -60 * STEP:], away_ns=(120 + away) * 10**9)
     page.close()
     assert len(told) == 4
     assert len({entry["at"] for entry in told}) == 1
+    assert [entry["diagnosed"] for entry in told] == ["", *["supply_sag"] * 3]
     assert all(abs(since - BEFORE) < 1.0 for since in (*(entry["since"] for entry in told),
                                                        watcher.places["actuator"].since_ns * 1e-9))
 
@@ -253,6 +257,26 @@ def test_the_bag_of_an_alarm_that_cannot_be_written_is_closed(tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     held = [os.path.realpath(entry) for entry in Path("/proc/self/fd").iterdir()]
     assert not [path for path in held if path.startswith(str(tmp_path))]
+
+
+def test_diagnose_of_the_bag_of_an_alarm_tells_its_verdict_or_why_there_is_none(bags, tmp_path, capfd):
+    duty, read = readings("bridge_drop", "v_drop", 0.2)
+    last = slice(round((BEFORE - 20.0) / SAMPLE_PERIOD), len(duty))
+    made = bags.content(len(duty[last]), columns=dict(zip(Samples._fields, (*read[:, last], duty[last]), strict=True)))
+    one = AlarmDiagnosis(bags.write(tmp_path / "alarm", made), "bench", 1, nice=0)
+    other = AlarmDiagnosis(tmp_path / "gone", "bench", 2, nice=0)
+    until = time.monotonic() + 120.0
+    while not (one.ended and other.ended) and time.monotonic() < until:
+        time.sleep(0.1)
+    assert one.verdict == "bridge_drop"
+    assert one.report.exists()
+    assert other.verdict == ""
+    (line,) = capfd.readouterr().err.splitlines()
+    assert "gone" in line
+    endless = AlarmDiagnosis(tmp_path / "alarm", "bench", 3, nice=0)
+    endless.close()
+    assert endless.ended
+    assert endless.verdict == ""
 
 
 def test_readings_that_do_not_change_are_frozen():

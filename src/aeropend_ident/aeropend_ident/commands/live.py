@@ -144,7 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _drive(folder, running, chance, options, page)
         finally:
             said = (folder / "watch.log").read_text(encoding="utf-8").splitlines()
-            told = [line for line in said if "parted" in line]
+            told = [line for line in said if "parted" in line or "diagnose says" in line]
             print("\n".join(["", *told, f"hidden in the plant: {drawn}, from {since:.1f} s after its start"]))
     return 0
 

@@ -14,8 +14,8 @@ from rosbags.typesys import Stores, get_typestore
 from aeropend_ident.bags.msgtypes import learn
 from aeropend_ident.bags.writer import BagWriter
 
-BEFORE_S, AFTER_S = 30.0, 30.0
-"""[s] Of a bag, before and after the alarm (choice: a minute, as `diagnose` needs)."""
+BEFORE_S, AFTER_S = 45.0, 15.0
+"""[s] Of a bag, before and after the alarm (choice: a minute, as `diagnose` needs, whose verdict is wanted soon)."""
 
 AT_ONCE = 2000
 """Messages that are written in one go (choice: some hundredths of a second)."""

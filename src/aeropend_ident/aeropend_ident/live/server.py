@@ -100,7 +100,6 @@ class Page:
         self._past: deque[list[Any]] = deque(maxlen=round(SHOWN_S / (SAMPLE_PERIOD * THINNED)))
         self._skip = 0
         self._history: deque[dict[str, Any]] = deque(maxlen=HISTORY)
-        self._listed = 0  # number of the alarm that is last in it
         self._state = ""
         self._sent_at = -math.inf
         self._nodes: dict[str, dict[str, Any]] = {}
@@ -189,16 +188,27 @@ class Page:
             self._nodes[name] = {"level": level, "message": message[:200],
                                  "cpu": values.get("cpu share", ""), "reference": values.get("reference", "")}
 
+    def diagnosed(self, alarm: int, verdict: str) -> None:
+        """Take what `diagnose` says of an alarm.
+
+        Args:
+            alarm: its number.
+            verdict: effect, "unknown", "none" or "cannot_tell".
+        """
+        for entry in self._history:
+            if entry["number"] == alarm:
+                entry["diagnosed"] = verdict
+
     def state(self, watcher: Watcher, intake: Intake, now: float) -> None:
         """Send the state of the places, if it is time."""
         alarm = watcher.alarm
         if alarm is not None:
-            entry = {"since": round(watcher.since_ns * 1e-9, 2), "at": round(watcher.alarm_ns * 1e-9, 2),
-                     "place": alarm.place, "effect": alarm.hypothesis, "probability": round(alarm.probability, 3)}
-            if self._listed == watcher.alarms:
-                self._history.pop()  # what is likeliest may change while an alarm stands
+            entry = {"number": watcher.alarms, "diagnosed": "", "since": round(watcher.since_ns * 1e-9, 2),
+                     "at": round(watcher.alarm_ns * 1e-9, 2), "place": alarm.place, "effect": alarm.hypothesis,
+                     "probability": round(alarm.probability, 3)}
+            if self._history and self._history[-1]["number"] == watcher.alarms:  # what is likeliest may change
+                entry["diagnosed"] = self._history.pop()["diagnosed"]
             self._history.append(entry)
-            self._listed = watcher.alarms
         if now < self._sent_at + STATE_S:
             return
         self._sent_at = now

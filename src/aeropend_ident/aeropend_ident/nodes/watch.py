@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import os
-import subprocess
 import sys
 import threading
 import time
@@ -29,6 +28,7 @@ from std_srvs.srv import Trigger
 from threadpoolctl import threadpool_limits
 
 from aeropend_control.nodes import wire
+from aeropend_ident.live.alarm_diagnosis import AlarmDiagnosis
 from aeropend_ident.live.detector import Finding
 from aeropend_ident.live.intake import Intake
 from aeropend_ident.live.ring import AlarmBag, Message, Ring
@@ -118,7 +118,9 @@ class Watch(Node):
         self._intake = Intake()
         self._ring = Ring()
         self._bag: AlarmBag | None = None
-        self._children: list[subprocess.Popen[bytes]] = []
+        self._bag_of = 0  # number of the alarm
+        self._running: list[AlarmDiagnosis] = []
+        self._diagnosed = ""  # verdict on the last alarm
         self._samples = self._malformed = 0
         self._heard = -math.inf
         self._crowded = self._told = ""
@@ -160,8 +162,8 @@ class Watch(Node):
                 self._bag.close()
             except _BAG_FAILS as error:
                 self._bag_fails(self._bag.path, error, "is not whole")
-        for child in self._children:
-            child.terminate()
+        for one in self._running:
+            one.close()
         self._subscriber.destroy_node()
 
     # ---- the thread ------------------------------------------------------------------------------------------------
@@ -199,7 +201,9 @@ class Watch(Node):
                   self._recorders.items() if self._names[name] in (interface.JOINT_STATES, interface.ARMATURE)
                   and r.publishers > 1]
         self._crowded = crowds[0] if crowds else ""
-        self._children = [child for child in self._children if child.poll() is None]
+        for one in [one for one in self._running if one.ended]:
+            self._running.remove(one)
+            self._on_diagnosed(one)
 
     def _drain(self, name: str, recorder: TopicRecorder) -> None:
         short, intake = self._names[name], self._intake
@@ -283,6 +287,7 @@ class Watch(Node):
     # ---- alarms ----------------------------------------------------------------------------------------------------
 
     def _on_alarm(self, found: Finding) -> None:
+        self._diagnosed = ""
         self._tell(found, "model and rig have parted")
         message = DiagnosticArray(status=self._statuses())
         message.header.stamp = self.get_clock().now().to_msg()
@@ -295,6 +300,7 @@ class Watch(Node):
             self._bag = AlarmBag(path, self._ring, {name: TOPICS[short] for name, short in self._names.items()},
                                  lambda topic: [qos_of(info.qos_profile) for info in
                                                 self.get_publishers_info_by_topic(topic)], time.time_ns())
+            self._bag_of = self._watcher.alarms
         except _BAG_FAILS as error:
             self._bag_fails(path, error, "cannot be made")
 
@@ -321,14 +327,19 @@ class Watch(Node):
         self._bag = None
         self.get_logger().info(f"the minute around the alarm is in {path}")
         if self._settings["diagnose"]:
-            self._diagnose(path)
+            self._running.append(AlarmDiagnosis(path, self._settings["model"], self._bag_of))
+            self.get_logger().info(f"diagnose runs on it; its report will be {self._running[-1].report}")
 
-    def _diagnose(self, bag: Path) -> None:
-        out = bag.with_name(f"{bag.name}-verdict")
-        command = ["nice", "-n", "19", sys.executable, "-m", "aeropend_ident.commands.diagnose", str(bag), "--model",
-                   self._settings["model"], "--out", str(out)]
-        self._children.append(subprocess.Popen(command, stdout=subprocess.DEVNULL))
-        self.get_logger().info(f"diagnose runs on it; its report will be {out / 'report.html'}")
+    def _on_diagnosed(self, one: AlarmDiagnosis) -> None:
+        verdict = one.verdict
+        if not verdict:
+            self.get_logger().error(f"diagnose has found no verdict for {one.out}: its line above says why")
+            return
+        self.get_logger().info(f"diagnose says of the minute around the alarm: {verdict}; see {one.report}")
+        if one.alarm == self._watcher.alarms:
+            self._diagnosed = verdict
+        if self._page is not None:
+            self._page.diagnosed(one.alarm, verdict)
 
     def _on_clear(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         there = self._watcher.alarm is not None
@@ -355,7 +366,8 @@ class Watch(Node):
         values = {
             "samples": self._samples, "bridged": self._intake.lost, "doubled": self._intake.doubled,
             "impossible readings": self._intake.odd, "malformed": self._malformed, "breaks": watcher.breaks,
-            "alarms": watcher.alarms, "lost": sum(r.lost for r in self._recorders.values()),
+            "alarms": watcher.alarms, "diagnosed": self._diagnosed,
+            "lost": sum(r.lost for r in self._recorders.values()),
             **{f"free run {channel}": gap[channel] for channel in gap},
             "learning": f"{watcher.to_learn:.0f} s of motion left" if watcher.to_learn else "done",
             "statistic": watcher.detector.statistic, "limit": watcher.detector.limit,

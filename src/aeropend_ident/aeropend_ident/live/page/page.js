@@ -65,6 +65,8 @@ function tell() {
     const [place, p] = parted[0];
     verdict.className = "bad";
     verdict.textContent = `parted at ${place} since ${clock(p.since)}: ${p.effect} (${Math.round(100 * p.probability)} %)`;
+    const last = s.history[s.history.length - 1];
+    if (last && last.diagnosed) verdict.textContent += `; diagnose of the minute around it: ${last.diagnosed}`;
   } else if (s.note) {
     verdict.className = "warn";
     verdict.textContent = s.note;
@@ -91,7 +93,8 @@ function tell() {
   });
   byId("places").replaceChildren(...rows);
   const history = s.history.slice().reverse().map(h => element("li",
-    `${clock(h.since)} ${h.place}: ${h.effect} (${Math.round(100 * h.probability)} %), told at ${clock(h.at)}`));
+    `${clock(h.since)} ${h.place}: ${h.effect} (${Math.round(100 * h.probability)} %), told at ${clock(h.at)}` +
+    (h.diagnosed ? `; diagnose: ${h.diagnosed}` : "")));
   byId("history").replaceChildren(...(history.length ? history : [element("li", "none so far")]));
   const nodes = Object.entries(s.nodes).map(([name, n]) => element("li",
     `${name}: ${n.message}${n.reference ? `, reference ${n.reference}` : ""}`));
