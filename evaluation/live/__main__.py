@@ -22,7 +22,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from aeropend_ident.diagnosis.diagnosis import diagnose
-from aeropend_ident.diagnosis.document import CANNOT_TELL
 from aeropend_ident.live import false_alarms
 from aeropend_ident.live.companion_model import Samples
 from aeropend_ident.live.intake import Batch
@@ -63,6 +62,7 @@ class Told:
         effect: told, the most probable at the end.
         levels: largest evidence of each ten seconds without a change.
         load: CPU time over rig time.
+        changed: effects that the residuals speak for.
         diagnosed: verdict of `diagnose` on the bag of the alarm; "": not asked.
     """
 
@@ -73,12 +73,13 @@ class Told:
     effect: str
     levels: list[float]
     load: float
+    changed: tuple[str, ...] = ()
     diagnosed: str = ""
 
     @property
     def named(self) -> str:
-        """The effect that `diagnose` names, or that of the alarm if it names none."""
-        return self.effect if self.diagnosed in ("", "none", "unknown", CANNOT_TELL) else self.diagnosed
+        """The effect that `diagnose` names, if it has changed; else that of the alarm."""
+        return self.diagnosed if self.diagnosed in self.changed else self.effect
 
 
 def watched(samples: Samples, since: float, watcher: Watcher | None = None) -> Told:
@@ -113,7 +114,8 @@ def watched(samples: Samples, since: float, watcher: Watcher | None = None) -> T
         places[f.place] = places.get(f.place, 0.0) + f.probability
     low, high = w.alarm.within
     return Told(alarm - since, w.alarm.since - since, low - 0.5 < since < high + 0.5,
-                max(places, key=lambda p: places[p]), best.hypothesis, levels, load_)
+                max(places, key=lambda p: places[p]), best.hypothesis, levels, load_,
+                tuple(f.hypothesis for f in d.findings if w.changed(f.hypothesis)))
 
 
 def case_of(k: int, seed: int, keep: Path | None, kind: str) -> rigs.Case:
@@ -198,7 +200,7 @@ def detection(all_: Sequence[tuple[rigs.Case, Told]]) -> list[tuple[str, str, st
         ("right effect", "90 %", share(sum(t.effect == c.effect for c, t in found), len(found))),
         *([("right effect, by `diagnose` of the bag", "-",
             share(sum(t.diagnosed == c.effect for c, t in found), len(found))),
-           ("right effect, by `diagnose` if it names one, else by the alarm", "90 %",
+           ("right effect, by `diagnose` if it names one that has changed, else by the alarm", "90 %",
             share(sum(t.named == c.effect for c, t in found), len(found)))] if any(t.diagnosed for _, t in found)
           else []),
         ("of effects that make less than 2 floors in the loop: alarm", "-",

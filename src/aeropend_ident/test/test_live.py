@@ -108,6 +108,14 @@ def test_an_effect_that_begins_is_told_with_instant_place_and_name(effect, param
     assert low - 0.5 < BEFORE < high + 0.5
 
 
+def test_what_a_stage_showed_while_the_rig_was_learned_is_no_alarm_there_and_hides_none_elsewhere(monkeypatch):
+    monkeypatch.setattr(learned().detector, "peaks", {**learned().detector.peaks, "motor": 1e5})
+    assert not watched(*readings("rotor_friction", "torque", 5e-4))[1]
+    watcher, alarms = watched(*readings("coulomb_friction", "accel", 0.3))
+    assert len(alarms) == 1
+    assert watcher.alarm.hypothesis == "coulomb_friction"
+
+
 def test_an_alarm_stays_until_it_is_cleared():
     watcher, _ = watched(*readings("bridge_drop", "v_drop", 0.2))
     watcher.silent("nothing comes")

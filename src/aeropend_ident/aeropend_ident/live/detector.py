@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aeropend_ident.diagnosis.chain.priors import SIZE_SD
-from aeropend_ident.diagnosis.chain.values import PLACE_OF_CHANNEL
+from aeropend_ident.diagnosis.chain.values import PLACE_OF_CHANNEL, STAGES
 from aeropend_ident.diagnosis.search.hypotheses import EFFECT_ODDS
 from aeropend_ident.diagnosis.search.onset import WITHIN
 from aeropend_ident.live.bank import Column, size_of
@@ -74,7 +74,7 @@ AGAIN = 15.0
 """[s] Time of motion in which the rig is learned after an alarm was cleared (choice: some references)."""
 
 RAISED = 2.0
-"""Multiple of the largest likelihood ratio while the rig was learned by which the limit is raised.
+"""Multiple of the largest likelihood ratio of a stage while the rig was learned by which its evidence is lowered.
 
 Choice: what a rig has shown once without a change it will show again, and perhaps somewhat larger."""
 
@@ -105,6 +105,19 @@ SETTLES = 3.0
 """[s] Time after a start in which nothing is judged (choice: the slowest start of rotor and observer)."""
 
 
+def _of_chance(channel: str) -> str:
+    """The hypothesis that the variance of a channel has grown."""
+    return "gust" if channel == "theta" else f"unknown:{channel}"
+
+
+PULSES = "pulses"
+"""Beside the stages of the chain: what only the intervals of the pulses show."""
+
+STAGES_OF_CHANCE = {"speed_spikes": (PULSES,), **{_of_chance(c): (stage,) for c, stage in zip(
+    CHANNELS, ("actuator", "motor", "motor", "arm"), strict=True)}}
+"""Hypotheses on the variance -> stages whose residuals they change."""
+
+
 @dataclass(frozen=True)
 class Finding:
     """A hypothesis on a change.
@@ -112,7 +125,8 @@ class Finding:
     Attributes:
         hypothesis: effect, or `parameter_mismatch:NAME`.
         place: of the chain.
-        evidence: log likelihood ratio against no change, with Occam factor and prior odds.
+        evidence: log likelihood ratio against no change, with Occam factor and prior odds, less what its stage may show
+            without a change.
         size: change of the size, SI.
         since: [s] instant, in the time of the detector: the middle of those that fit about as well.
         within: [s] the earliest and the latest of these, a 95 % interval by the profile likelihood.
@@ -270,12 +284,17 @@ class Detector:
     Args:
         columns: of the bank.
         limit: of the log likelihood ratios; see `false_alarms.limit`.
+
+    Attributes:
+        peaks: stage -> largest likelihood ratio while the rig was learned.
     """
 
     def __init__(self, columns: Sequence[Column], limit: float) -> None:
-        self.columns, self.least = list(columns), limit
-        self.learned, self.peak = 0.0, 0.0
-        self.stages = {b: _Stage([c for c in columns if b in c.stages], TICK) for b in ("actuator", "motor", "arm")}
+        self.columns, self.limit = list(columns), limit
+        self.learned = 0.0
+        self.peaks = dict.fromkeys((*STAGES, PULSES), 0.0)
+        self._stages_of = {c.hypothesis: c.stages for c in columns} | STAGES_OF_CHANCE
+        self.stages = {b: _Stage([c for c in columns if b in c.stages], TICK) for b in STAGES}
         self.variance = [_Variance() for _ in CHANNELS]
         self.time = 0.0
         self.tick = 0
@@ -292,11 +311,6 @@ class Detector:
         self._pending_s = 0.0
         self.statistic = 0.0
         self._shown: dict[str, PlaceState] = {}
-
-    @property
-    def limit(self) -> float:
-        """Limit of the likelihood ratios on this rig."""
-        return self.least + RAISED * self.peak
 
     # ---- samples
 
@@ -360,7 +374,9 @@ class Detector:
         self.findings = self.changes()
         self.statistic = max((f.evidence for f in self.findings), default=0.0)
         if self.learned < LEARNS:
-            self.peak = max(self.peak, self.statistic)
+            for f in self.findings:
+                for stage in self._stages_of[f.hypothesis]:
+                    self.peaks[stage] = max(self.peaks[stage], f.evidence)
             return None
         if self.alarm is None and self.findings and self.statistic > self.limit:
             self._freeze(*self.findings[0].within)
@@ -372,6 +388,12 @@ class Detector:
             if best.evidence > self.alarm.evidence or best.hypothesis == self.alarm.hypothesis:
                 self.alarm = best
         return None
+
+    def _shown_before(self, hypothesis: str) -> float:
+        """Evidence for a hypothesis that its stages may show without a change."""
+        if self.learned < LEARNS:
+            return 0.0
+        return RAISED * max(self.peaks[stage] for stage in self._stages_of[hypothesis])
 
     def _show(self, shown: dict[str, PlaceState], c: Column, information: Array, size: float, mean: Array, k: int
               ) -> None:
@@ -386,7 +408,8 @@ class Detector:
             k: the likeliest instant.
         """
         at = int(np.argmax(information))
-        needed = self.limit + 0.5 * math.log1p(max(information[at], 0.0) * (c.wide / c.sd) ** 2) - c.log_odds
+        needed = (self.limit + self._shown_before(c.hypothesis) - c.log_odds
+                  + 0.5 * math.log1p(max(information[at], 0.0) * (c.wide / c.sd) ** 2))
         least = math.sqrt(2.0 * needed / max(information[at], 1e-12))  # in standard deviations of the size
         limit = max(least * math.sqrt(mean[at]), 1e-9) if information[at] > 1e-9 else math.inf
         gap = size * math.sqrt(mean[k])
@@ -410,7 +433,7 @@ class Detector:
             self._frozen[name] = [(held[k], held[k + guard]) for k in near] or self._pairs(stage)
 
     def changes(self) -> list[Finding]:
-        """All hypotheses on a change, the likeliest first, each at its likeliest instant."""
+        """All hypotheses on a change, the most probable first, each at its likeliest instant."""
         table: dict[tuple[object, ...], tuple[list[Column], list[tuple[Array, Array, Array]]]] = {}
         times: list[float] = []
         for name, stage in self.stages.items():
@@ -449,20 +472,24 @@ class Detector:
             self._show(shown, c, u @ information @ u, far, np.maximum(u @ mean @ u, 0.0), k)
             if not np.isfinite(evidence[k]):
                 continue
+            usual = self._shown_before(c.hypothesis)
             total[c.hypothesis] = np.logaddexp(total.get(c.hypothesis, -np.inf), np.logaddexp.reduce(evidence))
-            if c.hypothesis not in best or evidence[k] > best[c.hypothesis].evidence:
+            if c.hypothesis not in best or evidence[k] - usual > best[c.hypothesis].evidence:
                 near = [times[i] for i in np.flatnonzero(
                     evidence > evidence[k] - WITHIN - INEXACT * abs(evidence[k]))]
                 best[c.hypothesis] = Finding(
-                    c.hypothesis, c.place, float(evidence[k]), float(told[k]), 0.5 * (min(near) + max(near)),
+                    c.hypothesis, c.place, float(evidence[k]) - usual, float(told[k]), 0.5 * (min(near) + max(near)),
                     far * math.sqrt(max(float(u @ mean[k] @ u), 0.0)), (min(near), max(near)))
         self._shown = shown
         for f in self._random():
-            best[f.hypothesis], total[f.hypothesis] = f, f.evidence
+            best[f.hypothesis], total[f.hypothesis] = f, f.evidence + self._shown_before(f.hypothesis)
+        for name, f in best.items():
+            if f.evidence <= self.limit:  # its stage may show as much without a change
+                total[name] = min(total[name], f.evidence)
         top = max(total.values(), default=0.0)
         like = {name: math.exp((v - top) / (1.0 + MISFIT * max(top, 0.0))) for name, v in total.items()}
         found = [replace(f, probability=like[f.hypothesis] / sum(like.values())) for f in best.values()]
-        return sorted(found, key=lambda f: -f.evidence)
+        return sorted(found, key=lambda f: -f.probability)
 
     def shows(self, place: str) -> PlaceState:
         """What a place shows in the window.
@@ -489,16 +516,13 @@ class Detector:
 
     def _random(self) -> list[Finding]:
         """The effects of chance, by their cumulative sums."""
-        found = []
-        odds = math.log(EFFECT_ODDS)
-        if self.spikes > 0.0:
-            found.append(Finding("speed_spikes", "sensing", self.spikes + odds, math.nan, self.spikes_since, 0.0,
-                                 (self.spikes_since, self.time)))
-        for c, v in zip(CHANNELS, self.variance, strict=True):
-            if v.cusum > 0.0:
-                name = "gust" if c == "theta" else f"unknown:{c}"
-                found.append(Finding(name, PLACE_OF_CHANNEL[c], v.cusum + odds, math.nan, v.since, 0.0,
-                                     (v.since, self.time)))
+        grown = [(_of_chance(c), PLACE_OF_CHANNEL[c], v.cusum, v.since)
+                 for c, v in zip(CHANNELS, self.variance, strict=True)]
+        spikes = "speed_spikes", "sensing", self.spikes, self.spikes_since
+        found = [Finding(name, place, value + math.log(EFFECT_ODDS) - self._shown_before(name), math.nan, since, 0.0,
+                         (since, self.time)) for name, place, value, since in (spikes, *grown) if value > 0.0]
+        if any(f.hypothesis == "speed_spikes" and f.evidence > self.limit for f in found):
+            return [f for f in found if f.hypothesis != _of_chance("omega")]  # the spikes make the variance grow
         return found
 
     def clear(self) -> None:

@@ -163,6 +163,14 @@ class Watcher:
         self.detector.clear()
         self._look()
 
+    def changed(self, effect: str) -> bool:
+        """Whether the residuals speak for a change of an effect at the instant of the alarm.
+
+        Args:
+            effect: its id.
+        """
+        return any(f.hypothesis == effect and f.evidence > 0.0 for f in self.detector.findings)
+
     def _stale(self, why: str) -> None:
         self.fault = why
         for name, place in self.places.items():

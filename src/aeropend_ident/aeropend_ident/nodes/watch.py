@@ -36,6 +36,7 @@ from aeropend_ident.live.watcher import DRIFTED, PARTED, STALE, Place, Watcher
 from aeropend_ident.nodes import said
 from aeropend_ident.nodes.topic_recorder import TopicRecorder, qos_of
 from aeropend_sim.errors import UserError
+from aeropend_sim.model.effects import DEFINED
 from aeropend_sim.model.parameters import PRESETS, load
 from aeropend_sim.ros import interface
 from aeropend_sim.ros.diagnostics import CpuShare, Diagnostics
@@ -93,6 +94,9 @@ USAGE = usage(
     ],
     "  The service ~/clear takes the rig as it is now, after an alarm.",
 )
+
+THERE_BEFORE = ", which was there before the alarm"
+"""Said of an effect that `diagnose` finds, and of which the residuals show no change."""
 
 LEVEL = {PARTED: DiagnosticStatus.ERROR, DRIFTED: DiagnosticStatus.WARN, STALE: DiagnosticStatus.STALE}
 
@@ -335,6 +339,8 @@ class Watch(Node):
         if not verdict:
             self.get_logger().error(f"diagnose has found no verdict for {one.out}: its line above says why")
             return
+        if verdict in DEFINED and not self._watcher.changed(verdict):
+            verdict += THERE_BEFORE
         self.get_logger().info(f"diagnose says of the minute around the alarm: {verdict}; see {one.report}")
         if one.alarm == self._watcher.alarms:
             self._diagnosed = verdict
