@@ -26,7 +26,7 @@ from aeropend_ident.live.detector import Finding
 from aeropend_ident.live.intake import Batch, Intake
 from aeropend_ident.live.ring import AlarmBag, Message, Ring
 from aeropend_ident.live.server import Page
-from aeropend_ident.live.watcher import PARTED, STALE, Watcher
+from aeropend_ident.live.watcher import DRIFTED, EXPLAINED, PARTED, STALE, Watcher
 from aeropend_ident.nodes.topic_recorder import DEPTH
 from aeropend_ident.nodes.watch import why
 from aeropend_sim.model import effect_file
@@ -103,6 +103,8 @@ def test_an_effect_that_begins_is_told_with_instant_place_and_name(effect, param
     assert len(alarms) == 1
     assert 0.0 < alarms[0] - BEFORE < 8.0
     assert watcher.places[place].state == PARTED
+    others = [p for name, p in watcher.places.items() if name != place]
+    assert all((p.state == EXPLAINED) == (p.gap > p.limit) for p in others if p.state != DRIFTED)
     assert watcher.alarm.hypothesis == effect
     low, high = watcher.alarm.within
     assert low - 0.5 < BEFORE < high + 0.5

@@ -27,7 +27,8 @@ diagnosis)."""
 MOVES, MOVES_S = 0.01, 5.0
 """Spread of the duty over about so many seconds above which the rig counts as moving (choice: 1 % of its range)."""
 
-OK, NOT_EXCITED, DRIFTED, PARTED, STALE = "ok", "not excited enough to say", "drifted", "parted", "stale"
+OK, NOT_EXCITED, EXPLAINED = "ok", "not excited enough to say", "explained by the alarm"
+DRIFTED, PARTED, STALE = "drifted", "parted", "stale"
 """States of a place."""
 
 
@@ -209,6 +210,8 @@ class Watcher:
             here = [f for f in d.findings if f.place == name]
             seen = d.shows(name)
             state = NOT_EXCITED if not seen.excited else OK
+            if d.alarm is not None and seen.gap > seen.limit:
+                state = EXPLAINED
             finding = max(here, key=lambda f: f.evidence, default=None)
             since, effect, probability, size = 0, "", 0.0, math.nan
             if d.alarm is not None and d.alarm.place == name:
