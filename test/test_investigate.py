@@ -51,7 +51,7 @@ def test_what_was_found_before_an_experiment_failed_is_kept(tmp_path):
             assert plant.stop() == 0
             assert inquiry.wait(180.0) == 2, inquiry.output
             *_, last = inquiry.output.strip().splitlines()
-    assert f"investigate: {out / '2' / 'recording'}: " in last
+    assert "investigate: no rig listens to /gone/duty_command: start a plant or a bridge first" in last
     assert last.endswith(f"; {out / 'verdict'} has the verdict so far")
     assert json.loads((out / "verdict" / "diagnosis.json").read_text())["bags"] == [str(out / "1" / "recording")]
 

@@ -29,6 +29,14 @@ def test_when_an_effect_begins_or_ends(effect, since, until):
     assert abs(at.value - true) < 0.5
 
 
+@pytest.mark.parametrize(("seed", "since", "until"), [(63, 18.0, np.inf), (70, 18.0, np.inf), (62, 0.0, 18.0)])
+def test_a_friction_begins_or_ends_that_is_far_from_linear_in_its_size(seed, since, until):
+    found = diagnose(BENCH, [changing(seed, {"coulomb_friction": {"accel": 1.6}}, since, until)]).conclusions.which
+    assert found.effects == ("coulomb_friction",)
+    (at,) = (c.since or c.until for c in found.candidates if c.found)
+    assert abs(at.value - 18.0) < 0.5
+
+
 def test_a_delay_begins_between_two_steps_of_the_duty():
     found = diagnose(BENCH, [changing(31, {"command_delay": {}}, 9.4)]).conclusions.which
     assert found.effects == ("command_delay",)

@@ -106,6 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if not options.yes and not agreed():
                 inquiry.ended = "The experiment was refused."
                 break
+            wait_for_rig(ros)  # since the last time the rig may have ended, or somebody may have begun to drive it
             bag = place / "recording"
             record_excited(bag, ["--params-file", str(place / "experiment.yaml")],
                            proposal.designed.excitation.duration, environment={**os.environ, "PYTHONUNBUFFERED": "1"},

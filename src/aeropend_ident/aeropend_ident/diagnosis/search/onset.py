@@ -3,7 +3,8 @@
 
 Where a stage is not explained, each effect is tried as if it acted only from an instant on, or only until then. To
 first order this is one least-squares solve for each instant; cumulative sums make it as cheap as one. If an instant
-stands out, the whole search is made again with effects that act only there, and the better search counts.
+stands out, the whole search is made again with effects that act only there, and the better search counts. If none is
+better, the part that the nominal model explains alone gives an instant: it needs no effect that is nearly linear.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from aeropend_ident.diagnosis.chain.chain import CutChain, CutChains
 from aeropend_ident.diagnosis.chain.priors import nominal_parameters
 from aeropend_ident.diagnosis.chain.values import STAGES
 from aeropend_ident.diagnosis.document import Interval
-from aeropend_ident.diagnosis.policy import MATERIAL
+from aeropend_ident.diagnosis.policy import GOOD_ENOUGH, MATERIAL
 from aeropend_ident.diagnosis.search.findings import Findings, adopted
 from aeropend_ident.diagnosis.search.free_curves import missing_terms
 from aeropend_ident.diagnosis.search.hypotheses import (
@@ -60,6 +61,9 @@ FOLLOWED, PASSES, ROUNDS = 4, 2, 2
 
 FOUND = 0.5
 """[s] Distance of two windows' instants above which both are searched (choice: what counts as found)."""
+
+UNDISTURBED = 0.25
+"""Least share of what is fitted that must be without the effect for a window that no effect was fitted in (choice)."""
 
 NEAR = 0.05
 """[s] Distance of an instant from its estimate within which the search is not made again (choice: a tenth of what
@@ -102,12 +106,15 @@ def search_within_windows(chains: CutChains, findings: dict[str, Findings],
     Returns:
         The chains, the findings and the onset of the better search; without an onset those that were given.
     """
-    found: _Within | None = None
-    for window in suspected(chains, findings):
-        one = _searched_within(chains, findings, window, searched)
-        if one is not None and (found is None or _fits_better(found, one)):
-            found = one
-    return found or (chains, findings, None)
+    for windows in (suspected, departures):
+        found: _Within | None = None
+        for window in windows(chains, findings):
+            one = _searched_within(chains, findings, window, searched)
+            if one is not None and (found is None or _fits_better(found, one)):
+                found = one
+        if found is not None:
+            return found
+    return chains, findings, None
 
 
 _Within = tuple[CutChains, dict[str, Findings], Onset]
@@ -161,15 +168,65 @@ def suspected(chains: CutChains, findings: Mapping[str, Findings]) -> list[Windo
         chains: cut; of several recordings, and of an uncalibrated rig, whose searches are long, none is suspected.
         findings: what the search found with effects that act all the time.
     """
-    if len(chains.each) > 1 or not chains.policy.calibrated:
-        return []
-    open_ = [b for b in STAGES if findings[b].base.residuals and not passes_as_noise(findings[b].final, MATERIAL)]
+    open_ = _not_explained(chains, findings)
     if not open_:
         return []
     every = hypotheses(chains.model, chains.further, chains.left_out, mismatches=False)
     changed = stages_of(chains, every)
     each = (_best_windows(chains, b, findings[b], [h for h in every if changed[h.name][:1] == (b,)]) for b in open_)
     return next((windows for windows in each if windows), [])
+
+
+def departures(chains: CutChains, findings: Mapping[str, Findings]) -> list[Window]:
+    """The windows outside of which the nominal model explains a stage, of the first stage that has some.
+
+    They take no effect for linear in its size. A dry friction is not: an arm that sticks stays where it is.
+
+    Args:
+        chains: as for `suspected`.
+        findings: as for `suspected`.
+    """
+    each = (_departures(chains, b, findings[b].base) for b in _not_explained(chains, findings))
+    return next((windows for windows in each if windows), [])
+
+
+def _not_explained(chains: CutChains, findings: Mapping[str, Findings]) -> list[str]:
+    """The stages in which an effect with an instant may be."""
+    if len(chains.each) > 1 or not chains.policy.calibrated:
+        return []
+    return [b for b in STAGES if findings[b].base.residuals and not passes_as_noise(findings[b].final, MATERIAL)]
+
+
+def _departures(chains: CutChains, stage: str, base: Fit) -> list[Window]:
+    """The windows outside of which the nominal model, fitted to what is outside alone, explains a stage."""
+    chain, signals = chains.each[0], chains.recordings[0]
+    known = [p for p in nominal_parameters(chains, stage) if p.name in base.values]
+    residuals, rows = chain.residuals(stage), {c: rows_of(chain, key(c).name) for c in base.residuals}
+
+    def explained(first: int, last: int) -> bool:
+        part = {c: slice(*np.searchsorted(at, (first, last))) for c, at in rows.items()}
+        f = fit(lambda values: {c: r[part[c]] for c, r in residuals(values).items()}, known, ROUNDS)
+        return max(f.scale.values()) <= GOOD_ENOUGH
+
+    n, least, near = signals.train, round(UNDISTURBED * signals.train), round(GRID / signals.period)
+    if explained(0, n):
+        return []
+    before = _largest(least, n, near, lambda k: explained(0, k))
+    after = _largest(least, n, near, lambda k: explained(n - k, n))
+    return [*([(before, len(signals))] if before else []), *([(0, n - after)] if after else [])]
+
+
+def _largest(first: int, last: int, near: int, holds: Callable[[int], bool]) -> int | None:
+    """The largest number, within `near`, for which a condition holds that `last` does not meet.
+
+    None: `first` does not meet it.
+    """
+    if not holds(first):
+        return None
+    while last - first > near:
+        middle = (first + last) // 2
+        first, last = (middle, last) if holds(middle) else (first, middle)
+    return first
 
 
 def with_window(chains: CutChains, window: Window) -> CutChains:
