@@ -110,7 +110,8 @@ def search_within_windows(chains: CutChains, findings: dict[str, Findings],
         found: _Within | None = None
         for window in windows(chains, findings):
             one = _searched_within(chains, findings, window, searched)
-            if one is not None and (found is None or _fits_better(found, one)):
+            if one is not None and (windows is suspected or _explains(one)) and (
+                    found is None or _fits_better(found, one)):
                 found = one
         if found is not None:
             return found
@@ -136,6 +137,11 @@ def _searched_within(chains: CutChains, findings: Mapping[str, Findings], window
             break
         window = moved
     return found
+
+
+def _explains(found: _Within) -> bool:
+    """Whether no effect is missing in the stages with effects: an unlisted one may act now and then, too."""
+    return all(max(f.final.scale.values()) <= GOOD_ENOUGH for f in found[1].values() if f.found)
 
 
 def _fits_better(one: _Within, other: _Within) -> bool:
