@@ -108,7 +108,7 @@ def watched(samples: Samples, since: float, watcher: Watcher | None = None) -> T
     load_ = (time.process_time() - begun) / max(d.time, 1e-9)
     if w.alarm is None:
         return Told(math.inf, math.nan, False, "", "", levels, load_)
-    best = max(d.findings, key=lambda f: f.probability)
+    best = d.findings[0]
     places: dict[str, float] = {}
     for f in d.findings:
         places[f.place] = places.get(f.place, 0.0) + f.probability

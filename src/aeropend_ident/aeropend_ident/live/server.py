@@ -193,7 +193,7 @@ class Page:
 
         Args:
             alarm: its number.
-            verdict: effect, "unknown", "none" or "cannot_tell".
+            verdict: of the document, as it is shown to a person.
         """
         for entry in self._history:
             if entry["number"] == alarm:

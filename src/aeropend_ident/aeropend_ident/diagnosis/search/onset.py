@@ -10,7 +10,8 @@ better, the part that the nominal model explains alone gives an instant: it need
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -106,16 +107,13 @@ def search_within_windows(chains: CutChains, findings: dict[str, Findings],
     Returns:
         The chains, the findings and the onset of the better search; without an onset those that were given.
     """
-    for windows in (suspected, departures):
-        found: _Within | None = None
-        for window in windows(chains, findings):
-            one = _searched_within(chains, findings, window, searched)
-            if one is not None and (windows is suspected or _explains(one)) and (
-                    found is None or _fits_better(found, one)):
-                found = one
-        if found is not None:
-            return found
-    return chains, findings, None
+    def searches(windows: Iterable[Window]) -> Iterator[_Within]:
+        each = (_searched_within(chains, findings, window, searched) for window in windows)
+        return (one for one in each if one is not None)
+
+    found = _best(searches(suspected(chains, findings))) or _best(
+        one for one in searches(departures(chains, findings)) if _explains(one))
+    return found or (chains, findings, None)
 
 
 _Within = tuple[CutChains, dict[str, Findings], Onset]
@@ -137,6 +135,15 @@ def _searched_within(chains: CutChains, findings: Mapping[str, Findings], window
             break
         window = moved
     return found
+
+
+def _best(each: Iterable[_Within]) -> _Within | None:
+    """The search of several whose window fits best; None of none."""
+    best: _Within | None = None
+    for one in each:
+        if best is None or _fits_better(best, one):
+            best = one
+    return best
 
 
 def _explains(found: _Within) -> bool:
@@ -217,22 +224,10 @@ def _departures(chains: CutChains, stage: str, base: Fit) -> list[Window]:
     n, least, near = signals.train, round(UNDISTURBED * signals.train), round(GRID / signals.period)
     if explained(0, n):
         return []
-    before = _largest(least, n, near, lambda k: explained(0, k))
-    after = _largest(least, n, near, lambda k: explained(n - k, n))
-    return [*([(before, len(signals))] if before else []), *([(0, n - after)] if after else [])]
-
-
-def _largest(first: int, last: int, near: int, holds: Callable[[int], bool]) -> int | None:
-    """The largest number, within `near`, for which a condition holds that `last` does not meet.
-
-    None: `first` does not meet it.
-    """
-    if not holds(first):
-        return None
-    while last - first > near:
-        middle = (first + last) // 2
-        first, last = (middle, last) if holds(middle) else (first, middle)
-    return first
+    ends = range(least, n, near)
+    before = bisect_left(ends, True, key=lambda k: not explained(0, k))  # number of ends up to which it is explained
+    after = bisect_left(ends, True, key=lambda k: not explained(n - k, n))
+    return [*([(ends[before - 1], len(signals))] if before else []), *([(0, n - ends[after - 1])] if after else [])]
 
 
 def with_window(chains: CutChains, window: Window) -> CutChains:
