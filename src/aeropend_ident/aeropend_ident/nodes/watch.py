@@ -339,7 +339,8 @@ class Watch(Node):
         if not verdict:
             self.get_logger().error(f"diagnose has found no verdict for {one.out}: its line above says why")
             return
-        if verdict in DEFINED and not self._watcher.changed(verdict):
+        stands = self._watcher.alarm is not None and one.alarm == self._watcher.alarms
+        if stands and verdict in DEFINED and not self._watcher.changed(verdict):
             verdict += THERE_BEFORE
         self.get_logger().info(f"diagnose says of the minute around the alarm: {verdict}; see {one.report}")
         if one.alarm == self._watcher.alarms:
